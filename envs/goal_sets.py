@@ -1,0 +1,193 @@
+"""Named goal sets: where the fixture stands at the start of an episode, 50 places per task.
+
+They are drawn by Meta-World's own task maker, so goal i of set s is a goal other people have too.
+`train` and `heldout` are packaged; reading them needs neither metaworld nor a simulator.
+
+NOTES
+1. One call of the maker per task, each with its own seed: all classes of one call share one random
+   stream, so in a joint call a task's goals would change with its neighbours.
+2. The maker keeps the second of the two draws each reset makes, as `reset_model` runs twice; that
+   is why the sets cannot be had from a plain uniform draw.
+
+`python -m envs.goal_sets` writes the packaged file again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import pickle
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
+GOALS = 50
+"""Goals of one task in a set: what Meta-World's task maker draws."""
+SEEDS = {"train": 0, "heldout": 1000}
+"""Seed of each packaged set."""
+
+RESET_BOX = {
+    "drawer-open": ((-0.1, 0.9, 0.0), (0.1, 0.9, 0.0)),
+    "drawer-close": ((-0.1, 0.9, 0.0), (0.1, 0.9, 0.0)),
+    "window-open": ((-0.1, 0.7, 0.16), (0.1, 0.9, 0.16)),
+    "window-close": ((0.0, 0.75, 0.2), (0.0, 0.9, 0.2)),
+}
+"""Lowest and highest fixture position (m) of each task; Meta-World's `_random_reset_space`."""
+
+_PACKAGED = Path(__file__).parent / "data" / "goal_sets.npz"
+_CACHE_VARIABLE = "CMRL_JAX_CACHE"
+
+
+def load_goal_set(
+    name: str, tasks: Sequence[str] = TASKS, cache: str | Path | None = None
+) -> np.ndarray:
+    """Returns the goals of a named set.
+
+    Args:
+        name: `train`, `heldout` or `fresh:<seed>`. A fresh set is drawn with metaworld on first
+            use (about a second a task) and then read from the cache.
+        tasks: task names; the order of the result's first axis.
+        cache: directory for fresh sets. Default: the environment variable CMRL_JAX_CACHE, else
+            `~/.cache/cmrl_jax`.
+
+    Returns:
+        float64 (task, 50, 3): fixture positions in metres, in the order Meta-World drew them.
+
+    Raises:
+        ValueError: unknown set or task, unreadable file, metaworld missing for a fresh set. The
+            message is two lines: cause, cure.
+    """
+    for task in tasks:
+        if task not in TASKS:
+            raise ValueError(f"unknown task {task!r}{_meant(task, TASKS)}\nvalid: {_list(TASKS)}")
+    if name in SEEDS:
+        packaged = _read(_PACKAGED, "python -m envs.goal_sets writes the packaged file again")
+        return np.stack([_goals(packaged, f"{name}/{task}", _PACKAGED) for task in tasks])
+
+    kind, _, seed_text = name.partition(":")
+    if kind != "fresh" or not seed_text.isascii() or not seed_text.isdigit():
+        meant = _meant(name, (*SEEDS, "fresh:0"))
+        raise ValueError(
+            f"unknown goal set {name!r}{meant}\n"
+            f"valid: {_list(SEEDS)}, fresh:<seed> with a whole number, for example fresh:7"
+        )
+    seed = int(seed_text)
+    if seed >= 2**32:
+        raise ValueError(f"the seed of goal set {name!r} is too large\nuse one below 2**32")
+    return np.stack([_fresh(task, seed, _cache_directory(cache)) for task in tasks])
+
+
+def draw_goals(task: str, seed: int) -> np.ndarray:
+    """Draws the 50 goals of one task with Meta-World's task maker; needs metaworld.
+
+    Args:
+        task: one of `TASKS`.
+        seed: the maker's seed, in [0, 2**32). The global numpy stream is left as it was.
+
+    Returns:
+        float64 (50, 3): fixture positions in metres.
+
+    Raises:
+        ValueError: metaworld is not installed.
+    """
+    try:
+        import metaworld
+        from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
+    except ImportError as error:
+        raise ValueError(
+            f"goal sets are drawn with the metaworld package: {error}\n"
+            "pip install metaworld==3.0.0, or use the packaged sets train and heldout"
+        ) from None
+    name = f"{task}-v3"
+    made: list[Any] = metaworld._make_tasks(
+        {name: ALL_V3_ENVIRONMENTS[name]},
+        {name: ML1_args_kwargs[name]},
+        {"partially_observable": True},
+        seed=seed,
+    )
+    return np.array([pickle.loads(task.data)["rand_vec"] for task in made], np.float64)
+
+
+def write_packaged(path: Path = _PACKAGED) -> None:
+    """Draws `train` and `heldout` for every task and writes them to `path`, byte for byte the
+    same each time."""
+    _write(path, {f"{n}/{t}": draw_goals(t, seed) for n, seed in SEEDS.items() for t in TASKS})
+
+
+def _fresh(task: str, seed: int, cache: Path) -> np.ndarray:
+    path = cache / "goals" / f"{task}-{seed}.npz"
+    if not path.is_file():
+        goals = draw_goals(task, seed)
+        try:
+            _write(path, {"goals": goals})
+        except OSError:
+            # The cache saves a second at the next start; a read-only home must not stop a run.
+            return goals
+    return _goals(_read(path, f"delete {path} and start again"), "goals", path)
+
+
+def _cache_directory(cache: str | Path | None) -> Path:
+    return Path(cache or os.environ.get(_CACHE_VARIABLE) or "~/.cache/cmrl_jax").expanduser()
+
+
+def _read(path: Path, cure: str) -> dict[str, np.ndarray]:
+    try:
+        # The file is opened here since np.load leaves its own handle open when the zip is broken.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            return {key: data[key] for key in data.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"the goal set file {path} cannot be read: {error}\n{cure}") from None
+
+
+def _goals(arrays: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
+    goals = arrays.get(key)
+    if goals is None or goals.shape != (GOALS, 3) or goals.dtype != np.float64:
+        got = "nothing" if goals is None else f"{goals.dtype} {goals.shape}"
+        raise ValueError(
+            f"the goal set file {path} holds {got} under {key!r}, not float64 ({GOALS}, 3)\n"
+            "python -m envs.goal_sets writes the packaged file again; delete a cached one"
+        )
+    return goals
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Writes an npz whose bytes depend on the arrays alone, and only ever whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
+            for key in sorted(arrays):
+                # np.savez stamps the time of day on each member; a fixed date keeps the file equal.
+                entry = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+                with archive.open(entry, "w") as member:
+                    np.lib.format.write_array(member, np.ascontiguousarray(arrays[key]))
+    os.chmod(part.name, 0o644)
+    os.replace(part.name, path)
+
+
+def _meant(got: str, valid: Sequence[str]) -> str:
+    close = difflib.get_close_matches(got, valid, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _list(names: Any) -> str:
+    return ", ".join(names)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Writes the packaged goal sets and prints the range of each."""
+    parser = argparse.ArgumentParser(prog="python -m envs.goal_sets", description=main.__doc__)
+    parser.add_argument("--out", type=Path, default=_PACKAGED, help="file to write")
+    out = parser.parse_args(argv).out
+    write_packaged(out)
+    for key, goals in _read(out, "run the command again").items():
+        print(f"{key:22s} {len(goals)} goals from {goals.min(0)} to {goals.max(0)} m")
+
+
+if __name__ == "__main__":
+    main()
