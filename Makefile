@@ -1,0 +1,47 @@
+# Set-up is `make train` or `make test`: both build .venv from requirements.lock when needed.
+# Variables: CONFIG=ml4.yaml ARGS="--train.minutes 45" VENV=.venv PYTHON=/path/to/python
+
+VENV = .venv
+CONFIG = ml4.yaml
+ARGS =
+PY = $(VENV)/bin/python
+STAMP = $(VENV)/.cmrl-installed
+
+.PHONY: train test lint smoke bench parity lock env
+
+train: $(STAMP)
+	$(PY) train.py --config $(CONFIG) $(ARGS)
+
+test: $(STAMP)
+	$(PY) -m pytest $(ARGS)
+
+lint: $(STAMP)
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright --pythonpath $(PY)
+
+smoke: $(STAMP)
+	$(PY) train.py --config smoke.yaml $(ARGS)
+
+bench: $(STAMP)
+	$(PY) train.py bench --json bench.json $(ARGS)
+
+parity: $(STAMP)
+	$(PY) -m envs.parity --json parity.json $(ARGS)
+
+# The newest versions: make lock ARGS=--upgrade. Names and versions only, the same for 3.12 and
+# 3.13 (checked by a dry run for each that uv finds); the cuda extra stays outside.
+lock: $(STAMP)
+	$(PY) -m uv pip compile pyproject.toml --extra dev --extra viz --python-version 3.12 \
+		--python-platform linux --strip-extras --no-header --no-annotate --no-emit-index-url \
+		--output-file requirements.lock --quiet $(ARGS)
+	for version in 3.12 3.13; do \
+		$(PY) -m uv pip compile requirements.lock --only-binary :all: --quiet \
+			--python-version $$version --output-file /dev/null || exit 1; \
+	done
+
+env: $(STAMP)
+
+$(STAMP): requirements.lock pyproject.toml
+	@VENV="$(VENV)" PYTHON="$(PYTHON)" sh scripts/make_env.sh
+	@touch $(STAMP)

@@ -1,0 +1,100 @@
+"""Which directory a run writes to: a new `runs/<config>-<time>`, or the one that is resumed.
+
+A directory holds a run from the moment one of `RUN_FILES` lies in it.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from pathlib import Path
+
+from cmrl_jax.config import ConfigError
+
+RUN_FILES = ("config.yaml", "metrics.csv", "ckpt")
+ROOT = Path("runs")
+_TIME = r"\d{8}-\d{6}(-\d+)?"
+
+
+def holds_run(path: Path) -> bool:
+    """Whether a run has begun to write into `path`."""
+    return any((path / name).exists() for name in RUN_FILES)
+
+
+def config_stem(path: Path) -> str:
+    """What runs of a config file are called: `ml4` for configs/ml4.yaml.
+
+    A run's own `runs/ml4-<time>/config.yaml` belongs to `ml4` too.
+    """
+    if path.name == "config.yaml" and holds_run(path.parent):
+        return re.sub(f"-{_TIME}$", "", path.resolve().parent.name)
+    return path.stem
+
+
+def runs_of(stem: str, root: Path = ROOT) -> list[Path]:
+    """Run directories of a config, oldest first."""
+    name = re.compile(f"{re.escape(stem)}-{_TIME}")
+    found = [p for p in root.glob("*") if name.fullmatch(p.name) and holds_run(p)]
+    return sorted(found, key=_age)
+
+
+def _age(path: Path) -> tuple[str, int]:
+    """Sorts `x-20260102-030405-2` behind `x-20260102-030405`."""
+    match = re.search(r"(\d{8}-\d{6})(?:-(\d+))?$", path.name)
+    assert match is not None  # runs_of matched the name
+    return match[1], int(match[2] or 0)
+
+
+def find_run(path: Path) -> Path:
+    """`path`, if it holds a run.
+
+    Raises:
+        ConfigError: naming the runs that are there.
+    """
+    if holds_run(path):
+        return path
+    known = [str(p) for p in sorted(ROOT.glob("*")) if holds_run(p)][-5:]
+    state = "holds no run" if path.is_dir() else "does not exist"
+    cure = f"give --run one of: {', '.join(known)}" if known else "train first: make train"
+    raise ConfigError(f"run directory {path} {state}", cure)
+
+
+def resumed_run(stem: str, run: Path | None) -> Path:
+    """The directory to resume: `run`, or the newest one of the config.
+
+    Raises:
+        ConfigError: where there is none.
+    """
+    if run is not None:
+        return find_run(run)
+    runs = runs_of(stem)
+    if not runs:
+        cause = f"--resume found no run of '{stem}' in {ROOT}/"
+        raise ConfigError(cause, "name it with --run DIR, or start one without --resume")
+    return runs[-1]
+
+
+def new_run(stem: str, run: Path | None, now: datetime.datetime | None = None) -> Path:
+    """Makes the directory of a new run: `run`, or `runs/<stem>-<time>`.
+
+    Raises:
+        ConfigError: where it holds a run already, or cannot be made.
+    """
+    if run is None:
+        time = (now or datetime.datetime.now()).strftime("%Y%m%d-%H%M%S")
+        base = ROOT / f"{stem}-{time}"
+        run, copy = base, 1
+        while run.exists():
+            run, copy = base.with_name(f"{base.name}-{copy}"), copy + 1
+    elif holds_run(run):
+        cause = f"run directory {run} already holds a run"
+        raise ConfigError(cause, "add --resume to go on with it, or give another --run DIR")
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        probe = run / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        cause = f"cannot write to run directory {run}: {error.strerror}"
+        raise ConfigError(cause, "give a directory you may write to: --run DIR") from error
+    return run
