@@ -20,6 +20,7 @@ import os
 import pickle
 import tempfile
 import zipfile
+from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -106,8 +107,8 @@ def draw_goals(task: str, seed: int) -> np.ndarray:
         ) from None
     name = f"{task}-v3"
     made: list[Any] = metaworld._make_tasks(
-        {name: ALL_V3_ENVIRONMENTS[name]},
-        {name: ML1_args_kwargs[name]},
+        OrderedDict({name: ALL_V3_ENVIRONMENTS[name]}),
+        OrderedDict({name: ML1_args_kwargs[name]}),
         {"partially_observable": True},
         seed=seed,
     )

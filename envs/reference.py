@@ -33,11 +33,6 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 from metaworld.types import Task
 
-OBS_SIZE = 39
-FRAME_SIZE = 18
-SLIDE = 9
-"""Index of the fixture's slide in qpos and qvel."""
-
 _POLICIES = {
     "drawer-open": policies.SawyerDrawerOpenV3Policy,
     "drawer-close": policies.SawyerDrawerCloseV3Policy,
@@ -175,7 +170,7 @@ class ReferenceEnv:
         # Any: the attributes a task sets in its reset are not declared on metaworld's base class.
         self._env: Any = self._class()
         self._fixture = task.split("-")[0]  # the scenes name the body so
-        self._prev_frame = np.zeros(FRAME_SIZE)
+        self._prev_frame = np.zeros(18)
 
     @property
     def env(self) -> SawyerXYZEnv:
@@ -263,7 +258,7 @@ class ReferenceEnv:
         data.mocap_pos[0] = state.mocap_pos
         data.mocap_quat[0] = (1, 0, 1, 0)
         data.ctrl[:] = (action[-1], -action[-1])
-        mujoco.mj_forward(env.model, data)
+        mujoco.mj_forward(env.model, data)  # pyright: ignore[reportAttributeAccessIssue]
         data.qacc_warmstart[:] = state.warmstart
 
         env.curr_path_length = 0
@@ -301,10 +296,6 @@ class ReferenceEnv:
             handle=np.array(env._get_pos_objects(), np.float64),
             handle_quat=np.array(env._get_quat_objects(), np.float64),
         )
-
-    def close(self) -> None:
-        """Frees the renderer, if one was used."""
-        self._env.close()
 
 
 class _QuietPolicy:
@@ -381,7 +372,6 @@ def record_rollout(
         states.append(env.get_state())
         rewards.append(reward)
         successes.append(success)
-    env.close()
     rows = {
         field.name: np.stack([getattr(state, field.name) for state in states])
         for field in dataclasses.fields(ReferenceState)

@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 import sys
+from collections import OrderedDict
 
 import metaworld
 import numpy as np
@@ -35,8 +36,8 @@ def test_goals_do_not_depend_on_neighbours():
     """In one joint call of the maker they would: that is why there is one call a task."""
     first, second = "drawer-open-v3", "window-open-v3"
     joint = metaworld._make_tasks(
-        {name: ALL_V3_ENVIRONMENTS[name] for name in (first, second)},
-        {name: ML1_args_kwargs[name] for name in (first, second)},
+        OrderedDict({name: ALL_V3_ENVIRONMENTS[name] for name in (first, second)}),
+        OrderedDict({name: ML1_args_kwargs[name] for name in (first, second)}),
         {"partially_observable": True},
         seed=0,
     )
