@@ -14,6 +14,9 @@ CAPACITY = LANES * STEPS
 EPISODE = 5
 GAMMA = 0.9
 
+sample = jax.jit(replay.sample, static_argnames=("batch", "n_step", "gamma"))
+add = jax.jit(replay.add)
+
 
 def make_steps(start: int, count: int, seed: int = 0) -> replay.Transition:
     """Vector steps `start`.. of lock-step episodes; obs[0] is the time, obs[1] the lane id.
@@ -46,10 +49,12 @@ def fill(chunks: list[int]):
     start = 0
     for count in chunks:
         steps = make_steps(start, count)
-        state = replay.add(state, steps)
+        state = add(state, steps)
+        steps = jax.tree.map(np.asarray, steps)
         for time in range(count):
             for (task, lane), records in deques.items():
-                records.append(jax.tree.map(lambda x: np.asarray(x)[time, task, lane], steps))  # noqa: B023
+                leaves = {name: x[time, task, lane] for name, x in vars(steps).items()}
+                records.append(replay.Transition(**leaves))
         start += count
     return state, deques
 
@@ -74,7 +79,7 @@ def test_samples_equal_loops_over_a_deque(chunks: list[int], n_step: int):
     state, deques = fill(chunks)
     assert int(state.size) == min(sum(chunks), STEPS) * LANES
     task_ids = jnp.array([1, 0, 1])
-    batch = replay.sample(state, jax.random.key(3), task_ids, 64, n_step, GAMMA)
+    batch = sample(state, jax.random.key(3), task_ids, batch=64, n_step=n_step, gamma=GAMMA)
     for row, task in enumerate(np.asarray(task_ids)):
         for i in range(64):
             obs = np.asarray(batch.obs[row, i])
@@ -89,16 +94,17 @@ def test_samples_equal_loops_over_a_deque(chunks: list[int], n_step: int):
             np.testing.assert_array_equal(batch.next_obs[row, i], next_obs)
 
 
-def test_a_window_never_crosses_lanes_or_a_restarted_episode():
-    """Trap 19: with reward = lane id, any mixture shows in the sum."""
+@pytest.mark.parametrize("sign", ["terminated", "truncated", "first"])
+def test_a_window_never_crosses_lanes_or_episodes(sign: str):
+    """Trap 19: with reward = lane id any mixture shows; each sign of a border is enough alone."""
     steps = make_steps(0, 11)
-    steps = steps.replace(
-        reward=steps.obs[..., 1],
-        terminated=jnp.zeros_like(steps.terminated),
-        truncated=jnp.zeros_like(steps.truncated),  # only `first` says that an episode began
-    )
-    state = replay.add(replay.init_replay(TASKS, CAPACITY, LANES, OBS, ACT), steps)
-    batch = replay.sample(state, jax.random.key(0), jnp.arange(TASKS), 256, 3, 1.0)
+    ends = steps.terminated | steps.truncated
+    none = jnp.zeros_like(ends)
+    signs = {"terminated": none, "truncated": none, "first": none}
+    signs[sign] = steps.first if sign == "first" else ends
+    steps = steps.replace(reward=steps.obs[..., 1], **signs)
+    state = add(replay.init_replay(TASKS, CAPACITY, LANES, OBS, ACT), steps)
+    batch = sample(state, jax.random.key(0), jnp.arange(TASKS), batch=256, n_step=3, gamma=1.0)
     time, lane = np.asarray(batch.obs[..., 0]), np.asarray(batch.obs[..., 1])
     length = np.minimum(np.minimum(3, EPISODE - time % EPISODE), 11 - time)
     np.testing.assert_array_equal(batch.reward, lane * length)
@@ -109,7 +115,7 @@ def test_a_window_never_crosses_lanes_or_a_restarted_episode():
 def test_sampling_covers_the_valid_slots_evenly():
     state, _ = fill([6])
     draws = 60_000
-    batch = replay.sample(state, jax.random.key(1), jnp.array([0]), draws, 1, GAMMA)
+    batch = sample(state, jax.random.key(1), jnp.array([0]), batch=draws, n_step=1, gamma=GAMMA)
     slot = np.asarray(batch.obs[0, :, 0] * LANES + batch.obs[0, :, 1]).astype(int)
     counts = np.bincount(slot, minlength=CAPACITY)
     assert (counts[6 * LANES :] == 0).all()
@@ -138,7 +144,7 @@ def test_an_empty_ring_gives_finite_zeros():
     state = replay.init_replay(TASKS, CAPACITY, LANES, OBS, ACT)
     task_ids = jnp.arange(TASKS)
     drawn = (
-        replay.sample(state, jax.random.key(0), task_ids, 4, 3, GAMMA),
+        sample(state, jax.random.key(0), task_ids, batch=4, n_step=3, gamma=GAMMA),
         replay.sample_transitions(state, jax.random.key(0), task_ids, 4),
     )
     assert int(state.size) == 0

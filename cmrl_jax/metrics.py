@@ -1,0 +1,296 @@
+"""Where a run's figures go: metrics.csv, the console, TensorBoard, versions.json.
+
+Every figure is written as the shortest text that is exact in float32, so two equal runs give equal
+files byte for byte; what is not a function of config and seed is named `wall_s` or `time/...`.
+"""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+import jax
+import numpy as np
+
+from cmrl_jax.config import ConfigError
+
+LEADING_COLUMNS = ("iteration", "env_steps", "gradient_steps", "wall_s", "seed")
+PACKAGES = (
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "orbax-checkpoint",
+    "brax",
+    "mujoco",
+    "mujoco-mjx",
+    "metaworld",
+    "numpy",
+)
+
+Row = Mapping[str, Any]
+
+
+def format_figure(value: Any) -> str:
+    """A number (Python, numpy or jax scalar) as CSV text; None is empty.
+
+    Integers are exact, floats the shortest text that reads back to the same float32.
+    """
+    if value is None:
+        return ""
+    number = np.asarray(value)
+    if number.shape != () or number.dtype.kind not in "biuf":
+        raise TypeError(f"a figure is one number, got {value!r}")
+    if number.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return str(np.float32(number))
+    return str(int(number))
+
+
+class MetricsCsv:
+    """metrics.csv: one row an iteration, each flushed, empty where a figure was not taken.
+
+    `offset` is the length in bytes after the last row. A checkpoint stores it, and a resumed run
+    cuts the file there: rows after the checkpoint, or half a row, will be written again.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], offset: int | None = None):
+        """Start a new file, or go on with one from `offset`.
+
+        Args:
+            path: the file.
+            columns: all columns of the run; they begin with `LEADING_COLUMNS`.
+            offset: where to go on; None starts the file anew.
+
+        Raises:
+            ConfigError: the file to go on with is missing, too short, or has other columns.
+            ValueError: the columns are not unique or do not begin with the leading ones.
+        """
+        self.columns = tuple(columns)
+        if self.columns[: len(LEADING_COLUMNS)] != LEADING_COLUMNS:
+            raise ValueError(f"columns must begin with {', '.join(LEADING_COLUMNS)}")
+        if len(set(self.columns)) < len(self.columns):
+            raise ValueError("a column stands twice")
+        header = (",".join(self.columns) + "\n").encode()
+        if offset is None:
+            self._file = open(path, "wb")
+            self._write(header)
+        else:
+            _check_resumable(path, header, offset)
+            self._file = open(path, "r+b")
+            self._file.truncate(offset)
+            self._file.seek(offset)
+        self.offset = self._file.tell()
+
+    def write(self, row: Row) -> None:
+        """Append one row.
+
+        Raises:
+            ValueError: a figure has no column, or a leading column has no figure.
+        """
+        unknown = sorted(set(row) - set(self.columns))
+        missing = [name for name in LEADING_COLUMNS if row.get(name) is None]
+        if unknown or missing:
+            raise ValueError(f"figures without a column: {unknown}; columns to fill: {missing}")
+        self._write((",".join(format_figure(row.get(c)) for c in self.columns) + "\n").encode())
+        self.offset = self._file.tell()
+
+    def _write(self, line: bytes) -> None:
+        self._file.write(line)
+        self._file.flush()  # a killed run keeps every row that it reported
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _check_resumable(path: Path, header: bytes, offset: int) -> None:
+    cure = "restore the file from a copy, or start a new run without --resume"
+    if not path.is_file():
+        raise ConfigError(f"{path} is missing, a resumed run would lose its rows", cure)
+    with open(path, "rb") as file:
+        found = file.readline()
+        if found != header:
+            old, new = (set(h.decode(errors="replace").strip().split(",")) for h in (found, header))
+            names = ", ".join(sorted(old ^ new)) or "their order"
+            raise ConfigError(
+                f"{path} has other columns than this program writes: {names}",
+                "resume with the version that wrote it (versions.json), or start a new run",
+            )
+        file.seek(max(offset - 1, 0))
+        if offset < len(header) or file.read(1) != b"\n":
+            cause = f"{path} does not end a row at byte {offset}, where its checkpoint was taken"
+            raise ConfigError(cause, cure)
+
+
+class TensorBoard:
+    """TensorBoard events over env steps, for `log.tensorboard`."""
+
+    def __init__(self, directory: Path, resume_at: int | None = None):
+        """Open an event file in `directory`; events after env step `resume_at` are superseded.
+
+        Raises:
+            ConfigError: tensorboardX is not installed.
+        """
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError as error:
+            raise ConfigError(
+                "log.tensorboard needs the package tensorboardX, which is not installed",
+                "pip install tensorboardX, or set log.tensorboard to false",
+            ) from error
+        self._writer = SummaryWriter(str(directory), purge_step=resume_at)
+
+    def write(self, row: Row) -> None:
+        """Add every figure of a row, except the leading columns."""
+        for name, value in row.items():
+            if name not in LEADING_COLUMNS and value is not None:
+                self._writer.add_scalar(name, float(value), int(row["env_steps"]))
+        self._writer.flush()
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+def format_duration(seconds: float) -> str:
+    """`42s`, `3m07s`, `2h05m`; `?` where it is not known."""
+    if not np.isfinite(seconds):
+        return "?"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours}h{minutes:02d}m"
+    return f"{minutes}m{rest:02d}s" if minutes else f"{rest}s"
+
+
+def figure_of(row: Row, name: str, tasks: Iterable[str]) -> float | None:
+    """`train/<name>`, or else the mean of `train/<task>/<name>` over the tasks that have it."""
+    if row.get(f"train/{name}") is not None:
+        return float(row[f"train/{name}"])
+    values = [row.get(f"train/{task}/{name}") for task in tasks]
+    taken = [float(value) for value in values if value is not None]
+    return float(np.mean(taken)) if taken else None
+
+
+def format_iteration(row: Row, tasks: Sequence[str], eta_s: float) -> str:
+    """The console line of an iteration; figures that the row lacks are left out.
+
+    Args:
+        row: columns of metrics.csv. Read are `train/<task>/success_any`, `train/<task>/return`,
+            `train/critic_loss`, `actor_loss`, `kl`, `routing_entropy` (or each per task) and
+            `time/env_steps_per_s`.
+        tasks: training tasks.
+        eta_s: seconds until the run ends.
+    """
+    parts = [f"iter {int(row['iteration']):>4}  {int(row['env_steps']):>10,} steps"]
+    for label, name, style in (("success", "success_any", ".2f"), ("return", "return", ".0f")):
+        values = ((task, row.get(f"train/{task}/{name}")) for task in tasks)
+        shown = [f"{task} {float(value):{style}}" for task, value in values if value is not None]
+        if shown:
+            parts.append(f"{label} {' '.join(shown)}")
+    figures = (
+        ("critic {:.3g}", "critic_loss"),
+        ("actor {:.3g}", "actor_loss"),
+        ("KL {:.2f} nats", "kl"),
+        ("routing {:.2f}", "routing_entropy"),
+    )
+    values = ((text, figure_of(row, name, tasks)) for text, name in figures)
+    shown = [text.format(value) for text, value in values if value is not None]
+    if shown:
+        parts.append("  ".join(shown))
+    if row.get("time/env_steps_per_s") is not None:
+        parts.append(f"{float(row['time/env_steps_per_s']):,.0f} steps/s")
+    parts.append(f"ETA {format_duration(eta_s)}")
+    return " | ".join(parts)
+
+
+def format_evaluation(row: Row) -> str | None:
+    """The success at any step of each `eval/<task>/k<k>` in the row; None if it has none."""
+    tasks: dict[str, list[str]] = {}
+    for name, value in row.items():
+        match = re.fullmatch(r"eval/([^/]+)/(k\d+)/success_any", name)
+        if match and value is not None:
+            tasks.setdefault(match[1], []).append(f"{match[2]} {float(value):.2f}")
+    if not tasks:
+        return None
+    return "evaluation | " + " | ".join(f"{t} {' '.join(shown)}" for t, shown in tasks.items())
+
+
+class Console:
+    """Lines on a stream, above a progress bar where the stream is a terminal."""
+
+    def __init__(self, progress: bool = True, stream: TextIO | None = None):
+        self._stream = stream or sys.stdout
+        self._progress = None
+        if progress and self._stream.isatty():
+            from rich.console import Console as RichConsole
+            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
+            console = RichConsole(file=self._stream, highlight=False, markup=False)
+            self._progress = Progress(*columns, console=console, transient=True)
+            self._bar = self._progress.add_task("training", total=1.0)
+            self._progress.start()
+
+    def line(self, text: str) -> None:
+        """Print one line."""
+        if self._progress is None:
+            print(text, file=self._stream, flush=True)
+        else:
+            self._progress.console.print(text, soft_wrap=True)
+
+    def advance(self, share: float) -> None:
+        """Show that this share of the run, 0 to 1, is done."""
+        if self._progress is not None:
+            self._progress.update(self._bar, completed=min(max(share, 0.0), 1.0))
+
+    def close(self) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+
+
+def package_versions() -> dict[str, str | None]:
+    """Versions that a checkpoint's or a result's numbers may depend on; None: not installed."""
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return versions
+
+
+def git_commit(root: Path | None = None) -> str | None:
+    """The commit of the source tree, marked `-dirty` if tracked files changed; None without git."""
+    root = root or Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():  # an installed wheel must not report the repository around it
+        return None
+    options = ["--always", "--dirty", "--abbrev=40", "--exclude=*"]  # the hash, never a tag
+    command = ["git", "-C", str(root), "describe", *options]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip() or None
+
+
+def write_versions(path: Path) -> dict[str, Any]:
+    """Write versions.json: packages, commit, device, processors and date; returns what it holds."""
+    device = jax.devices()[0]
+    versions = package_versions() | {
+        "commit": git_commit(),
+        "device": f"{device.platform}: {device.device_kind}",
+        "device_count": jax.device_count(),
+        "cpu_count": os.cpu_count(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+    path.write_text(json.dumps(versions, indent=2) + "\n", encoding="utf-8")
+    return versions
