@@ -16,7 +16,14 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
-from cmrl_jax.config_io import check_resumable, config_dirs, find_config, read_yaml, resolve
+from cmrl_jax.config_io import (
+    check_resumable,
+    config_dirs,
+    field_types,
+    find_config,
+    read_yaml,
+    resolve,
+)
 from cmrl_jax.run_dir import config_stem, find_run, new_run, resumed_run
 from cmrl_jax.validate import check_goal_set
 
@@ -104,8 +111,8 @@ def _shown(default: Any) -> str:
 def _metavar(default: Any, f: Any, name: str) -> str:
     owner: Any = Config
     for section in name.split(".")[:-1]:
-        owner = typing.get_type_hints(owner)[section]
-    hint = typing.get_type_hints(owner)[f.name]
+        owner = field_types(owner)[section]
+    hint = field_types(owner)[f.name]
     if typing.get_origin(hint) is Literal:
         return "|".join(typing.get_args(hint))
     if typing.get_origin(hint) is tuple:
@@ -133,7 +140,7 @@ def _train(words: list[str]) -> int:
 
     from cmrl_jax import trainer
 
-    return trainer.train(config, run_dir=run, resume=resume)
+    return trainer.train(config=config, run_dir=run, resume=resume)
 
 
 def _check_extras(config: Config) -> None:

@@ -6,6 +6,7 @@ silent conversions (`3e-4` is text to it, `017` is 15) is a `ConfigError` that n
 
 from __future__ import annotations
 
+import functools
 import math
 import typing
 from collections.abc import Mapping
@@ -28,6 +29,12 @@ FREE_ON_RESUME = (
     "log.",
     "checkpoint.",
 )
+
+
+@functools.cache
+def field_types(cls: type) -> dict[str, Any]:
+    """The types of a schema class, resolved from their annotations."""
+    return typing.get_type_hints(cls)
 
 
 class _Source:
@@ -199,7 +206,7 @@ def _section(cls: type, data: Any, prefix: str, source: _Source) -> Any:
         where = prefix.rstrip(".")
         cause = f"'{where}' is a section, got {_show(data)}{source(where)}"
         raise ConfigError(cause, f"write its keys below it; valid: {', '.join(_names(cls))}")
-    hints = typing.get_type_hints(cls)
+    hints = field_types(cls)
     values = {}
     for key, value in data.items():
         dotted = f"{prefix}{key}"
@@ -232,8 +239,8 @@ def _replace(config: Config, dotted: str, text: str) -> Config:
     owner, cls = data, Config
     *sections, key = dotted.split(".")
     for section in sections:
-        owner, cls = owner[section], typing.get_type_hints(cls)[section]
-    owner[key] = parse_flag(text, typing.get_type_hints(cls)[key], dotted)
+        owner, cls = owner[section], field_types(cls)[section]
+    owner[key] = parse_flag(text, field_types(cls)[key], dotted)
     return from_dict(data, _Source())
 
 

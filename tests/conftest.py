@@ -6,8 +6,27 @@ Set before jax is imported, as environment variables, so that subprocesses of te
 import os
 from pathlib import Path
 
+import pytest
+
+from cmrl_jax.cli import main  # imports neither jax nor mujoco
+
 CACHE = Path(__file__).resolve().parent.parent / ".cache" / "jax-tests"
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+
+
+@pytest.fixture
+def refused(capsys):
+    """Runs the command line on a user's mistake; returns its one line of cause and one of cure."""
+
+    def run(*words: str) -> tuple[str, str]:
+        code = main(words)
+        out, err = capsys.readouterr()
+        lines = err.splitlines()
+        assert (code, out, len(lines)) == (2, "", 2), (code, out, err)
+        assert lines[0].startswith("error: ") and lines[1].startswith("fix: "), err
+        return lines[0].removeprefix("error: "), lines[1].removeprefix("fix: ")
+
+    return run

@@ -1,0 +1,164 @@
+"""The shape of the repository: who may import whom, what is declared, what ships and what not."""
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts): path
+    for folder in ("cmrl_jax", "envs")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+}
+# Read and checked before jax is imported.
+LIGHT = {"config", "validate", "config_io", "run_dir", "cli"}
+# A module imports from its own row and later ones; modules not named here only make no cycle.
+ROWS = (
+    {"cli"},
+    {"trainer", "evaluate_cli", "bench"},
+    {"collect", "evaluate", "learner", "checkpoint", "metrics"},
+    {"losses", "objectives", "context", "replay"},
+    {"networks", "layers", "distributions", "normalizers", "goals", "run_dir", "config_io"},
+    {"validate"},
+    {"config"},
+)
+
+
+def imports(path: Path, top: bool = False) -> Iterator[str]:
+    """Dotted names that a file imports, `from a import b` as a.b; with `top`, at import time."""
+    nodes: list[ast.AST] = [ast.parse(path.read_text())]
+    while nodes:
+        node = nodes.pop()
+        if top and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        nodes.extend(ast.iter_child_nodes(node))
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def own(name: str, top: bool = False) -> set[str]:
+    """Modules of ours that a module of ours imports."""
+    found = set()
+    for imported in imports(MODULES[name], top):
+        found |= {m for m in (imported, imported.rpartition(".")[0]) if m in MODULES}
+    return found - {name}
+
+
+def importers(package: str) -> set[str]:
+    """Modules of ours that import a package or one of its parts."""
+    return {
+        name
+        for name, path in MODULES.items()
+        if any(f"{i}.".startswith(f"{package}.") for i in imports(path))
+    }
+
+
+def test_the_scan_sees_imports():
+    assert "cmrl_jax.config" in own("cmrl_jax.cli")
+    assert "cmrl_jax.trainer" not in own("cmrl_jax.cli", top=True)
+    assert "yaml" in set(imports(MODULES["cmrl_jax.config_io"]))
+
+
+def test_envs_know_nothing_of_the_learner():
+    for name in MODULES:
+        if name.startswith("envs"):
+            assert not [i for i in imports(MODULES[name]) if i.startswith("cmrl_jax")], name
+
+
+@pytest.mark.parametrize("name", sorted(LIGHT))
+def test_configuration_imports_nothing_heavy(name):
+    allowed = set(sys.stdlib_module_names) | {"yaml", "cmrl_jax"}
+    path = MODULES[f"cmrl_jax.{name}"]
+    top = name == "cli"  # its commands import the programs they run
+    assert {i.partition(".")[0] for i in imports(path, top)} <= allowed
+    assert {m.rpartition(".")[2] for m in own(f"cmrl_jax.{name}", top)} <= LIGHT
+
+
+def test_imports_point_one_way():
+    rank = {f"cmrl_jax.{name}": i for i, row in enumerate(ROWS) for name in row}
+    for name in MODULES:
+        backwards = {m for m in own(name) if rank.get(m, 99) < rank.get(name, -1)}
+        assert not backwards, f"{name} imports {backwards}"
+
+
+def test_no_import_cycle():
+    left = {name: own(name, top=True) - {"cmrl_jax", "envs"} for name in MODULES}
+    while left:
+        free = {name for name, needs in left.items() if not needs & set(left)}
+        assert free, f"a cycle among {sorted(left)}"
+        left = {name: needs for name, needs in left.items() if name not in free}
+
+
+def test_each_library_has_its_room():
+    assert importers("orbax") <= {"cmrl_jax.checkpoint"}
+    assert importers("flax.linen") <= {"cmrl_jax.networks", "cmrl_jax.layers"}
+    assert importers("transformers") <= {"cmrl_jax.build_goals"}
+    assert not importers("torch")
+    assert "transformers" not in {
+        i.partition(".")[0] for m in MODULES.values() for i in imports(m, top=True)
+    }
+
+
+def test_what_we_import_is_declared():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = project["dependencies"] + project["optional-dependencies"]["viz"]
+    names = {re.split(r"[\[<>=]", requirement)[0].lower() for requirement in declared}
+    as_imported = {"yaml": "pyyaml", "orbax": "orbax-checkpoint"}
+    for name, path in MODULES.items():
+        for imported in imports(path):
+            root = imported.partition(".")[0]
+            if root not in sys.stdlib_module_names and root not in ("cmrl_jax", "envs"):
+                assert as_imported.get(root, root).lower() in names, f"{name} imports {root}"
+        if any(i.startswith("mujoco.mjx") for i in imports(path)):
+            assert "mujoco-mjx" in names
+
+
+def test_no_file_is_over_400_lines():
+    files = [*MODULES.values(), *(ROOT / "tests").rglob("*.py"), *(ROOT / "scripts").glob("*")]
+    for path in [*files, ROOT / "train.py"]:
+        assert len(path.read_text().splitlines()) <= 400, path
+
+
+def test_readme_runs_before_line_30():
+    head = (ROOT / "README.md").read_text().splitlines()[:29]
+    assert any(line.startswith("make train") for line in head)
+
+
+def test_lock_holds_names_and_versions_only():
+    lines = (ROOT / "requirements.lock").read_text().splitlines()
+    locked = {}
+    for line in lines:
+        match = re.fullmatch(r"([a-z0-9]+(?:-[a-z0-9]+)*)==([0-9][0-9a-z.]*)", line)
+        assert match, line
+        locked[match[1]] = match[2]
+    assert locked["mujoco"] == locked["mujoco-mjx"] == "3.16.0"
+    assert locked["metaworld"] == "3.0.0"
+    assert not [name for name in locked if re.match(r"torch|nvidia|triton|jax-cuda|warp", name)]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    for requirement in project["dependencies"] + extras["dev"] + extras["viz"]:
+        assert re.split(r"[\[<>=]", requirement)[0].lower() in locked, requirement
+
+
+def test_wheel_ships_code_data_and_configs_but_no_tests(tmp_path):
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    [wheel] = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for folder in ("cmrl_jax", "envs"):
+        data = (ROOT / folder / "data").rglob("*")
+        wanted = {str(p.relative_to(ROOT)) for p in data if p.is_file()}
+        wanted |= {str(p.relative_to(ROOT)) for p in (ROOT / folder).rglob("*.py")}
+        assert wanted <= names
+    assert {f"cmrl_jax/configs/{p.name}" for p in (ROOT / "configs").glob("*.yaml")} <= names
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"cmrl_jax", "envs"}
