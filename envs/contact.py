@@ -1,0 +1,236 @@
+"""Narrow-phase collision of gripper shapes with fixture shapes, and the choice of contacts to keep.
+
+Per lane and substep there are 24 + 9 + 17 candidate points; only a few can be in contact at once,
+and each kept point costs the solver four to six rows. So every family keeps its deepest few.
+All functions are for one lane; callers vmap. Distances in metres, world frame.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.geometry import FixtureShapes, Gripper, Material
+
+FINGER_SLOTS, BASE_SLOTS, BOX_SLOTS = 4, 2, 4  # contacts kept a family
+_EPS = 1e-9
+
+
+class Contacts(NamedTuple):
+    """Contact points, gripper first: a positive `dist` beyond the margin is inactive."""
+
+    dist: jax.Array  # (contact,)
+    pos: jax.Array  # (contact, 3)
+    normal: jax.Array  # (contact, 3) from gripper to fixture
+    part: jax.Array  # (contact,) HAND, RIGHT or LEFT
+    moves: jax.Array  # (contact,) 1.0 if the fixture side rides on the slide
+    material: Material  # mixed
+
+
+def mix(gripper: Material, fixture: Material) -> Material:
+    """MuJoCo's mixing rule for equal priority and solmix: largest friction, mean solver values."""
+    return Material(
+        friction=jnp.maximum(gripper.friction, fixture.friction),
+        solref=0.5 * (gripper.solref + fixture.solref),
+        solimp=0.5 * (gripper.solimp + fixture.solimp),
+        margin=jnp.maximum(gripper.margin, fixture.margin),
+        invweight=gripper.invweight + fixture.invweight,
+    )
+
+
+def _take(material: Material, index: jax.Array) -> Material:
+    return Material(*(jnp.asarray(leaf)[index] for leaf in material))
+
+
+def _deepest(contacts: Contacts, count: int) -> Contacts:
+    """The `count` contacts with the smallest distance beyond their margin."""
+    _, index = jax.lax.top_k(contacts.material.margin - contacts.dist, count)
+    return jax.tree.map(lambda leaf: leaf[index], contacts)
+
+
+def point_box(point: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Signed distance and outward normal from a box at the origin to points (..., 3)."""
+    outside = point - jnp.clip(point, -half, half)
+    norm = jnp.sqrt(jnp.sum(outside**2, -1, keepdims=True) + _EPS**2)
+    depth = jnp.abs(point) - half  # negative inside
+    face = (depth == depth.max(-1, keepdims=True)) * jnp.sign(point + _EPS)
+    is_outside = jnp.any(depth > 0, -1, keepdims=True)
+    dist = jnp.where(is_outside, norm, depth.max(-1, keepdims=True))[..., 0]
+    return dist, jnp.where(is_outside, outside / norm, face)
+
+
+def _segment_box(start: jax.Array, end: jax.Array, half: jax.Array):
+    """Two parameters in [0, 1] where a segment (..., 3) lies closest over a box at the origin.
+
+    If the segment lies over a face, they are the ends of the overlap; at an edge or corner both are
+    the closest point.
+    """
+    along = end - start
+    length2 = jnp.sum(along**2, -1, keepdims=True)
+
+    def nearest(point: jax.Array) -> jax.Array:
+        return jnp.clip(jnp.sum((point - start) * along, -1, keepdims=True) / length2, 0.0, 1.0)
+
+    t = nearest(jnp.zeros_like(start))
+    for _ in range(4):  # alternating projection between segment and box
+        t = nearest(jnp.clip(start + t * along, -half, half))
+    _, normal = point_box(start + t * along, half)
+    lateral = jnp.abs(normal) < jnp.abs(normal).max(-1, keepdims=True)
+    safe = jnp.where(jnp.abs(along) < _EPS, _EPS, along)
+    one, two = (-half - start) / safe, (half - start) / safe
+    enter = jnp.where(lateral, jnp.minimum(one, two), -jnp.inf).max(-1, keepdims=True)
+    leave = jnp.where(lateral, jnp.maximum(one, two), jnp.inf).min(-1, keepdims=True)
+    enter, leave = jnp.clip(enter, 0.0, 1.0), jnp.clip(leave, 0.0, 1.0)
+    over_face = leave > enter
+    return jnp.where(over_face, enter, t), jnp.where(over_face, leave, t), over_face[..., 0]
+
+
+def finger_capsule_contacts(
+    gripper: Gripper,
+    shapes: FixtureShapes,
+    link_pos: jax.Array,
+    link_rot: jax.Array,
+    finger_slide: jax.Array,
+    handle_shift: jax.Array,
+) -> Contacts:
+    """Finger boxes (4) against handle capsules (3), two points a pair."""
+    hand = link_rot @ gripper.hand_rotation  # axes of the finger boxes in the world
+    slide = jnp.concatenate([jnp.zeros(1), finger_slide])[gripper.finger_part]
+    axis = jnp.concatenate([jnp.zeros((1, 3)), gripper.finger_axis])[gripper.finger_part]
+    center = link_pos + (gripper.finger_center + axis * slide[:, None]) @ link_rot.T  # (4, 3)
+    ends = shapes.capsule_ends + handle_shift  # (3, 2, 3)
+    local = (ends[None] - center[:, None, None]) @ hand  # (box, capsule, end, 3)
+    half = jnp.asarray(gripper.finger_half)[:, None]
+    first, second, over_face = _segment_box(local[:, :, 0], local[:, :, 1], half)
+    t = jnp.stack([first, second], 2)  # (box, capsule, 2, 1)
+    point = local[:, :, :1] + t * (local[:, :, 1:] - local[:, :, :1])
+    dist, normal = point_box(point, half[:, :, None])
+    dist = dist - shapes.capsule_radius[None, :, None]
+    radius = jnp.asarray(shapes.capsule_radius)[None, :, None, None]
+    surface = point - normal * (radius + 0.5 * dist[..., None])  # midway between both surfaces
+    # One touching point, not two equal ones, where the capsule lies over an edge.
+    dist = dist.at[:, :, 1].set(jnp.where(over_face, dist[:, :, 1], 1.0))
+    material = mix(
+        Material(*(jnp.asarray(x)[:, None, None] for x in gripper.finger_material)),
+        Material(*(jnp.asarray(x)[None, :, None] for x in shapes.capsule_material)),
+    )
+    pairs = dist.shape
+    flat = lambda x, tail=(): jnp.broadcast_to(x, pairs + tail).reshape((-1, *tail))
+    return Contacts(
+        dist=flat(dist),
+        pos=flat(surface @ hand.T + center[:, None, None], (3,)),
+        normal=flat(normal @ hand.T, (3,)),
+        part=flat(jnp.asarray(gripper.finger_part)[:, None, None]),
+        moves=flat(jnp.ones(())),
+        material=Material(*(flat(leaf, leaf.shape[3:]) for leaf in material)),
+    )
+
+
+def base_capsule_contacts(
+    gripper: Gripper,
+    shapes: FixtureShapes,
+    link_pos: jax.Array,
+    link_rot: jax.Array,
+    handle_shift: jax.Array,
+) -> Contacts:
+    """Gripper base capsules (3) against handle capsules (3), one point a pair."""
+    ends = link_pos + jnp.asarray(gripper.base_ends) @ link_rot.T
+    p, d1 = ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None]  # (3, 1, 3)
+    handle = shapes.capsule_ends + handle_shift
+    q, d2 = handle[None, :, 0], (handle[:, 1] - handle[:, 0])[None]
+    r = p - q
+    dot = lambda a, b: jnp.sum(a * b, -1)
+    a, e, b, c, f = dot(d1, d1), dot(d2, d2), dot(d1, d2), dot(d1, r), dot(d2, r)
+    s = jnp.clip((b * f - c * e) / jnp.maximum(a * e - b * b, 1e-12), 0.0, 1.0)
+    t = jnp.clip((b * s + f) / e, 0.0, 1.0)
+    s = jnp.clip((b * t - c) / a, 0.0, 1.0)
+    near, far = p + s[..., None] * d1, q + t[..., None] * d2
+    gap = far - near
+    norm = jnp.sqrt(jnp.sum(gap**2, -1) + _EPS**2)
+    radius1 = jnp.asarray(gripper.base_radius)[:, None]
+    dist = norm - radius1 - shapes.capsule_radius[None]
+    normal = gap / norm[..., None]
+    material = mix(
+        Material(*(jnp.asarray(x)[:, None] for x in gripper.base_material)),
+        Material(*(jnp.asarray(x)[None] for x in shapes.capsule_material)),
+    )
+    flat = lambda x: x.reshape((-1, *x.shape[2:]))
+    return Contacts(
+        dist=flat(dist),
+        pos=flat(near + normal * (radius1 + 0.5 * dist)[..., None]),
+        normal=flat(normal),
+        part=jnp.zeros(dist.size, jnp.int32),
+        moves=jnp.ones(dist.size),
+        material=Material(*(flat(leaf) for leaf in material)),
+    )
+
+
+def sphere_box_contacts(
+    gripper: Gripper,
+    shapes: FixtureShapes,
+    link_pos: jax.Array,
+    link_rot: jax.Array,
+    finger_slide: jax.Array,
+    placement: jax.Array,
+    handle_shift: jax.Array,
+) -> Contacts:
+    """Each gripper sphere (17) against the box it is deepest in: case, panels, frame, table."""
+    slide = jnp.concatenate([jnp.zeros(1), finger_slide])[gripper.sphere_part]
+    axis = jnp.concatenate([jnp.zeros((1, 3)), gripper.finger_axis])[gripper.sphere_part]
+    center = link_pos + (gripper.sphere_center + axis * slide[:, None]) @ link_rot.T  # (17, 3)
+    placed = jnp.asarray(shapes.box_placed)[:, None]
+    moves = jnp.asarray(shapes.box_moves)[:, None]
+    box = shapes.box_center + placed * placement + moves * (handle_shift - placement)  # (BOXES, 3)
+    local = center[:, None] - box[None]
+    dist, _ = point_box(local, jnp.asarray(shapes.box_half)[None])  # (17, BOXES)
+    nearest = jnp.argmin(dist, 1)
+    local = jnp.take_along_axis(local, nearest[:, None, None], 1)[:, 0]
+    dist, normal = point_box(local, jnp.asarray(shapes.box_half)[nearest])
+    dist = dist - gripper.sphere_radius
+    radius = jnp.asarray(gripper.sphere_radius)[:, None]
+    return Contacts(
+        dist=dist,
+        pos=center - normal * (radius + 0.5 * dist[:, None]),
+        normal=-normal,
+        part=jnp.asarray(gripper.sphere_part),
+        moves=jnp.asarray(shapes.box_moves)[nearest],
+        material=mix(
+            Material(*(jnp.asarray(x) for x in gripper.sphere_material)),
+            _take(shapes.box_material, nearest),
+        ),
+    )
+
+
+def find_contacts(
+    gripper: Gripper,
+    shapes: FixtureShapes,
+    link_pos: jax.Array,
+    link_rot: jax.Array,
+    finger_slide: jax.Array,
+    placement: jax.Array,
+    handle_shift: jax.Array,
+) -> tuple[Contacts, Contacts]:
+    """The kept contacts: with torsional friction (finger boxes on the handle), and without.
+
+    Args:
+        link_pos, link_rot: pose of the last arm link, (3,) and (3, 3).
+        finger_slide: slide positions of right and left finger (2,).
+        placement: the fixture's position (3,).
+        handle_shift: position of the fixture's moving part less its offset at slide 0 (3,), that is
+            placement + axis * slide.
+    """
+    fingers = finger_capsule_contacts(
+        gripper, shapes, link_pos, link_rot, finger_slide, handle_shift
+    )
+    base = base_capsule_contacts(gripper, shapes, link_pos, link_rot, handle_shift)
+    boxes = sphere_box_contacts(
+        gripper, shapes, link_pos, link_rot, finger_slide, placement, handle_shift
+    )
+    smooth = jax.tree.map(
+        lambda *leaves: jnp.concatenate(leaves),
+        _deepest(base, BASE_SLOTS),
+        _deepest(boxes, BOX_SLOTS),
+    )
+    return _deepest(fingers, FINGER_SLOTS), smooth

@@ -1,0 +1,208 @@
+"""The ML4 environment: one lane of any task, written once over a physics backend.
+
+`reset(key, task_id)` and `step(state, action)` are pure functions of one lane; callers vmap them.
+Tasks are data, so lanes of different tasks share one compiled program. Reward, observation and
+success follow Meta-World V3; they are computed from a small struct of positions that any backend
+can fill in.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from envs import rewards
+from envs.model import SLIDE, load_scene
+from envs.mjx_physics import MjxPhysics, PhysicsState, Positions
+from envs.tasks import (
+    ACTION_SCALE,
+    HAND_HIGH,
+    HAND_LOW,
+    OBS_HAND_HIGH,
+    OBS_HAND_LOW,
+    SCENE_ID,
+    SPECS,
+    Task,
+)
+
+OBS_SIZE, ACTION_SIZE, FRAME = 39, 4, 18
+SETTLE_STEPS, FRAME_SKIP = 50, 5  # SawyerXYZEnv._reset_hand
+
+
+@struct.dataclass
+class State:
+    """One lane's environment state."""
+
+    physics: PhysicsState
+    task_id: jax.Array  # () int32, index into `tasks.TASKS`
+    frame: jax.Array  # (18,) last frame, the second half of the next observation
+    obs: jax.Array  # (39,) frame, previous frame, goal (zeros when hidden)
+    reward: jax.Array  # () in [0, 10]
+    success: jax.Array  # () bool, at this very step
+    distance: jax.Array  # () metres between object and target, the quantity success is judged by
+    steps: jax.Array  # () int32, control steps since the reset
+
+
+class _TaskData:
+    """`SPECS` as arrays with a leading task axis, and each task's settled start state."""
+
+    def __init__(self) -> None:
+        column = lambda field: jnp.asarray(
+            np.array([getattr(spec, field) for spec in SPECS], np.float32)
+        )
+        self.hand_start = column("hand_start")
+        self.placement_low = column("placement_low")
+        self.placement_high = column("placement_high")
+        self.start_slide = column("start_slide")
+        self.first_obs_slide = column("first_obs_slide")
+        self.handle = column("handle")
+        self.has_quaternion = column("has_quaternion")
+        self.target = column("target")
+        starts = [settle(spec) for spec in SPECS]
+        self.qpos, self.qvel, self.warm_start, self.hand, self.opening, self.init_tcp = (
+            jnp.asarray(np.stack(leaves), jnp.float32) for leaves in zip(*starts, strict=True)
+        )
+
+
+def settle(spec: Task):
+    """The start of every episode of a task, by MuJoCo C in float64.
+
+    Meta-World pulls the hand from the zero pose to its start for 50 x 5 substeps at every reset;
+    the outcome does not depend on the goal, so it is computed once. What Meta-World then shows and
+    remembers is one substep behind the state, unless the task runs a forward pass (drawer-close).
+
+    Returns:
+        qpos (10,), qvel (10,), warm start (10,), hand (3,) and gripper opening () as observed
+        after a reset, and the finger-tip midpoint (3,) that the reward refers to.
+    """
+    model = load_scene(spec.scene)
+    data = mujoco.MjData(model)
+    for _ in range(SETTLE_STEPS):
+        data.mocap_pos[0] = spec.hand_start
+        data.mocap_quat[0] = [1, 0, 1, 0]
+        data.ctrl[:] = [-1, 1]
+        mujoco.mj_step(model, data, nstep=FRAME_SKIP)
+    tips = [data.site(name).xpos for name in ("rightEndEffector", "leftEndEffector")]
+    init_tcp = np.mean(tips, 0)
+    qpos, qvel, warm_start = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
+    if spec.forward_at_reset:
+        mujoco.mj_forward(model, data)
+    gap = np.linalg.norm(data.body("rightclaw").xpos - data.body("leftclaw").xpos)
+    opening = np.clip(gap / 0.1, 0.0, 1.0)
+    return qpos, qvel, warm_start, data.body("hand").xpos.copy(), opening, init_tcp
+
+
+class Ml4Env:
+    """Static data of the environment.
+
+    Args:
+        goal_observable: show the target in the last three observation numbers.
+    """
+
+    observation_size = OBS_SIZE
+    action_size = ACTION_SIZE
+
+    def __init__(self, goal_observable: bool = False):
+        self.physics = MjxPhysics()
+        self.goal_observable = goal_observable
+        self.tasks = _TaskData()
+        self._scene_id = jnp.asarray(SCENE_ID)
+
+    def reset(self, key: jax.Array, task_id: jax.Array) -> State:
+        """A fresh episode with a random placement of the fixture (Meta-World's reset box)."""
+        low, high = self.tasks.placement_low[task_id], self.tasks.placement_high[task_id]
+        return self.reset_to(task_id, low + (high - low) * jax.random.uniform(key, (3,)))
+
+    def reset_to(self, task_id: jax.Array, placement: jax.Array) -> State:
+        """A fresh episode with the fixture at `placement` (3,), a goal of a named goal set."""
+        tasks = self.tasks
+        task_id = jnp.asarray(task_id, jnp.int32)
+        physics = PhysicsState(
+            qpos=tasks.qpos[task_id].at[SLIDE].set(tasks.start_slide[task_id]),
+            qvel=tasks.qvel[task_id],
+            warm_start=tasks.warm_start[task_id],
+            mocap=tasks.hand_start[task_id],
+            placement=jnp.asarray(placement, jnp.float32),
+        )
+        fixture = self.physics.scene(self._scene_id[task_id]).fixture
+        shown = physics.placement + fixture.offset + fixture.axis * tasks.first_obs_slide[task_id]
+        frame = self._frame(tasks.hand[task_id], tasks.opening[task_id], shown, task_id)
+        goal = self._target(physics, task_id) * float(self.goal_observable)
+        zero = jnp.zeros(())
+        return State(
+            physics=physics,
+            task_id=task_id,
+            frame=frame,
+            obs=jnp.concatenate([frame, frame, goal]),
+            reward=zero,
+            success=jnp.zeros((), bool),
+            distance=zero,
+            steps=jnp.zeros((), jnp.int32),
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step. `action` (4,): hand displacement / 0.01 m, finger effort, in [-1, 1]."""
+        action = jnp.clip(action, -1.0, 1.0)
+        mocap = state.physics.mocap + action[:3] * ACTION_SCALE
+        mocap = jnp.clip(mocap, jnp.array(HAND_LOW), jnp.array(HAND_HIGH))
+        ctrl = jnp.stack([action[3], -action[3]])
+        scene = self._scene_id[state.task_id]
+        physics = self.physics.step(state.physics.replace(mocap=mocap), ctrl, scene)
+        positions = self.physics.positions(physics, scene)
+        return self.observe(state, physics, positions, action)
+
+    def observe(
+        self, state: State, physics: PhysicsState, positions: Positions, action: jax.Array
+    ) -> State:
+        """The state after a control step, from the new physics state and its positions."""
+        task_id = state.task_id
+        opening = jnp.clip(positions.finger_gap / 0.1, 0.0, 1.0)
+        frame = self._frame(positions.hand, opening, positions.fixture, task_id)
+        goal = jnp.zeros(3)
+        if self.goal_observable:
+            goal = jnp.clip(
+                self._target(physics, task_id), jnp.array(HAND_LOW), jnp.array(HAND_HIGH)
+            )
+        obs = jnp.concatenate([_clip_hand(frame), _clip_hand(state.frame), goal])
+        scene = self.physics.scene(self._scene_id[task_id])
+        start = physics.placement + scene.fixture.offset + self.tasks.handle[task_id]
+        inputs = rewards.RewardInputs(
+            hand=obs[:3],
+            tcp=0.5 * (positions.right_tip + positions.left_tip),
+            handle=positions.fixture + self.tasks.handle[task_id],
+            slide=positions.slide,
+            gripper_effort=action[3],
+            init_tcp=self.tasks.init_tcp[task_id],
+            init_handle=start + scene.fixture.axis * self.tasks.start_slide[task_id],
+        )
+        values = [reward(inputs) for reward in rewards.REWARDS]
+        pick = lambda i: jnp.stack([value[i] for value in values])[task_id]
+        return state.replace(
+            physics=physics,
+            frame=frame,
+            obs=obs,
+            reward=pick(0),
+            distance=pick(1),
+            success=pick(2),
+            steps=state.steps + 1,
+        )
+
+    def _target(self, physics: PhysicsState, task_id: jax.Array) -> jax.Array:
+        return physics.placement + self.tasks.target[task_id]
+
+    def _frame(
+        self, hand: jax.Array, opening: jax.Array, fixture: jax.Array, task_id: jax.Array
+    ) -> jax.Array:
+        """Hand (3), gripper opening, object position (3), quaternion (4), zeros (7)."""
+        quaternion = jnp.array([1.0, 0.0, 0.0, 0.0]) * self.tasks.has_quaternion[task_id]
+        handle = fixture + self.tasks.handle[task_id]
+        return jnp.concatenate([hand, opening[None], handle, quaternion, jnp.zeros(7)])
+
+
+def _clip_hand(frame: jax.Array) -> jax.Array:
+    """Meta-World clips a step's observation to its space; only the hand can leave it."""
+    hand = jnp.clip(frame[:3], jnp.array(OBS_HAND_LOW), jnp.array(OBS_HAND_HIGH))
+    return jnp.concatenate([hand, frame[3:]])
