@@ -1,0 +1,289 @@
+"""Checkpoints: `DIR/ckpt/` to resume a run exactly, `DIR/policy/` to act. Only importer of orbax.
+
+Trees are stored flat, {path: array}, and rebuilt from an abstract tree: so None nodes, empty tuples
+and optax's named tuples survive, and a difference is reported by the name of the array. Saves are
+atomic (orbax writes a temporary directory and renames it): a kill leaves the previous step intact.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import orbax.checkpoint as ocp
+
+from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config_io import check_resumable
+
+FULL_ITEMS = ("learner", "replay", "context")
+POLICY_ITEMS = ("policy",)
+META_FIELDS = (
+    "config",
+    "iteration",
+    "env_steps",
+    "wall_s",
+    "csv_offset",
+    "versions",
+    "goals_sha256",
+)
+
+
+class CheckpointStore:
+    """The checkpoints in one directory, by iteration.
+
+    A writer keeps the newest `keep` steps and removes what a killed save left behind; a reader
+    changes nothing, so it may look at a run that is still going on. Use as a context manager:
+    leaving it waits for the last save.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        items: tuple[str, ...],
+        keep: int | None = None,
+        read_only: bool = False,
+    ):
+        """Open a store; the functions `full_store` and `policy_store` name the two of a run.
+
+        Raises:
+            ConfigError: nothing to read there, or the directory cannot be written.
+        """
+        self.directory = directory.absolute()  # orbax refuses relative paths
+        self.items = items
+        if not read_only:
+            try:
+                self.directory.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                cause = f"cannot write checkpoints to {directory}: {error.strerror}"
+                cure = "give a run directory you may write to: --run DIR"
+                raise ConfigError(cause, cure) from error
+        elif not self.directory.is_dir():
+            raise _nothing_saved(self.directory)
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=ocp.checkpoint_managers.LatestN(n=keep) if keep else None,
+            cleanup_tmp_directories=not read_only,
+            read_only=read_only,
+            create=False,
+            save_interval_steps=0 if read_only else 1,
+        )
+        with _quiet_orbax():
+            self._manager = ocp.CheckpointManager(
+                self.directory, item_names=(*items, "meta"), options=options
+            )
+
+    def steps(self) -> list[int]:
+        """Iterations that can be restored, oldest first."""
+        return sorted(self._manager.all_steps())
+
+    def save(self, trees: Mapping[str, Any], meta: Mapping[str, Any]) -> bool:
+        """Store the trees as step `meta["iteration"]`; False if that step is stored already.
+
+        Returns as soon as the arrays are copied, files are written in the background: the trees
+        may be donated afterwards, and `wait` says when the step is safe.
+
+        Args:
+            trees: one pytree of arrays for each item of the store; None for none.
+            meta: exactly `META_FIELDS`, plain JSON data.
+
+        Raises:
+            ValueError: other items or fields than the store's, or an iteration before the last.
+        """
+        if set(trees) != set(self.items) or set(meta) != set(META_FIELDS):
+            raise ValueError(f"got {sorted(trees)} and {sorted(meta)}, not the store's fields")
+        step, saved = meta["iteration"], self.steps()
+        if saved and step <= saved[-1]:
+            if step in saved:
+                return False
+            raise ValueError(f"iteration {step} comes after {saved[-1]} was saved")
+        flat = {name: _flatten(tree) for name, tree in trees.items()}
+        args = {name: ocp.args.StandardSave(leaves) for name, leaves in flat.items() if leaves}
+        # Copied as text here: orbax writes it later, when the caller may have changed it.
+        args["meta"] = ocp.args.JsonSave(json.loads(json.dumps(meta)))
+        with _quiet_orbax():
+            self._manager.save(step, args=ocp.args.Composite(**args))
+        return True
+
+    def read_meta(self, step: int | None = None) -> dict[str, Any]:
+        """The meta record of a step, the newest by default.
+
+        Raises:
+            ConfigError: no such step, or it cannot be read.
+        """
+        step = self._choose(step)
+        meta = self._read(step, {"meta": ocp.args.JsonRestore()})["meta"]
+        if not isinstance(meta, dict) or set(meta) != set(META_FIELDS):
+            raise self._unreadable(step, "its meta record has other fields")
+        return meta
+
+    def restore(
+        self,
+        abstract: Mapping[str, Any],
+        config: Config | None = None,
+        step: int | None = None,
+        versions: Mapping[str, str | None] | None = None,
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The trees and the meta record of a step, the newest by default.
+
+        Args:
+            abstract: for each item a pytree like the saved one, of `jax.ShapeDtypeStruct` (from
+                `jax.eval_shape`) or arrays. A sharding given there is used, else the first device.
+            config: what the run goes on with; compared with the saved one first.
+            step: iteration.
+            versions: this process's `package_versions()`; a difference prints one warning line.
+
+        Raises:
+            ConfigError: no such step, it cannot be read, the config differs in a field that
+                matters, or the arrays differ from `abstract`. Each names what and a cure.
+        """
+        step = self._choose(step)
+        meta = self.read_meta(step)
+        if config is not None:
+            check_resumable(meta["config"], config, self.directory.parent)
+        if versions is not None:
+            _warn_of_versions(self.directory / str(step), meta["versions"], versions)
+        wanted = {name: _flatten(abstract[name]) for name in self.items}
+        self._check_arrays(step, wanted)
+        args = {
+            name: ocp.args.StandardRestore({path: _placed(leaf) for path, leaf in leaves.items()})
+            for name, leaves in wanted.items()
+            if leaves
+        }
+        found = self._read(step, args) if args else {}
+        trees = {name: _unflatten(abstract[name], found.get(name) or {}) for name in self.items}
+        return trees, meta
+
+    def wait(self) -> None:
+        """Block until the last save is on disk; a failed save raises here."""
+        with _quiet_orbax():
+            self._manager.wait_until_finished()
+
+    def close(self) -> None:
+        """Wait and release."""
+        with _quiet_orbax():
+            self._manager.close()
+
+    def __enter__(self) -> CheckpointStore:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _choose(self, step: int | None) -> int:
+        steps = self.steps()
+        if not steps:
+            raise _nothing_saved(self.directory)
+        if step is None:
+            return steps[-1]
+        if step not in steps:
+            there = ", ".join(map(str, steps))
+            raise ConfigError(f"no checkpoint {step} in {self.directory}", f"there are: {there}")
+        return step
+
+    def _read(self, step: int, args: Mapping[str, Any]) -> Any:
+        try:
+            with _quiet_orbax():
+                return self._manager.restore(step, args=ocp.args.Composite(**args))
+        except Exception as error:  # orbax, tensorstore and json each have their own classes
+            raise self._unreadable(step, f"{type(error).__name__}: {error}") from error
+
+    def _unreadable(self, step: int, reason: str) -> ConfigError:
+        path = self.directory / str(step)
+        older = [other for other in self.steps() if other < step]
+        cure = f"remove {path} to go on from {older[-1]}" if older else "start a new run"
+        lines = reason.strip().splitlines() or ["unknown reason"]
+        return ConfigError(f"checkpoint {path} cannot be read: {lines[0][:200]}", cure)
+
+    def _check_arrays(self, step: int, wanted: Mapping[str, Mapping[str, Any]]) -> None:
+        """Names the first array that the program and the checkpoint do not share."""
+        for item, leaves in wanted.items():
+            path = self.directory / str(step) / item
+            saved = {}
+            if path.exists():
+                try:
+                    with _quiet_orbax(), ocp.StandardCheckpointer() as reader:
+                        saved = reader.metadata(path).item_metadata.tree
+                except Exception as error:
+                    raise self._unreadable(step, f"{type(error).__name__}: {error}") from error
+            elif leaves:
+                raise self._unreadable(step, f"{item} is missing")
+            for name in sorted(leaves.keys() | saved.keys()):
+                old = _describe(saved[name]) if name in saved else "absent"
+                new = _describe(leaves[name]) if name in leaves else "absent"
+                if old != new:
+                    raise ConfigError(
+                        f"checkpoint {path} does not fit: {name} is {old} there, {new} here",
+                        "use the configuration and version that wrote it (versions.json)",
+                    )
+
+
+def full_store(run: Path, keep: int | None = None, read_only: bool = False) -> CheckpointStore:
+    """`DIR/ckpt`: learner (with the key and counters), replay and context rings, newest `keep`."""
+    return CheckpointStore(run / "ckpt", FULL_ITEMS, keep, read_only)
+
+
+def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
+    """`DIR/policy`: what acting needs (actor, encoder, observation statistics, goals); all kept."""
+    return CheckpointStore(run / "policy", POLICY_ITEMS, None, read_only)
+
+
+def _nothing_saved(directory: Path) -> ConfigError:
+    cure = "name a run that has saved one with --run DIR, or train without --resume"
+    return ConfigError(f"no checkpoint in {directory}", cure)
+
+
+def _flatten(tree: Any) -> dict[str, Any]:
+    """{path: leaf}; arrays without elements are left out, because orbax refuses them."""
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+        if leaf.size
+    }
+
+
+def _unflatten(abstract: Any, leaves: Mapping[str, Any]) -> Any:
+    """The tree of `abstract` with the arrays that `_flatten` named."""
+
+    def fill(path: Any, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        return leaves[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(fill, abstract)
+
+
+def _placed(leaf: Any) -> jax.ShapeDtypeStruct:
+    """The leaf with a sharding of this process: the stored one may name devices it lacks."""
+    sharding = leaf.sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+
+
+def _describe(leaf: Any) -> str:
+    """`float32[3, 4]`; typed keys as the numbers that are stored for them."""
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.eval_shape(jax.random.key_data, leaf)
+    return f"{leaf.dtype}{list(leaf.shape)}"
+
+
+def _warn_of_versions(path: Path, saved: Mapping[str, Any], here: Mapping[str, Any]) -> None:
+    names = sorted(name for name in saved.keys() | here.keys() if saved.get(name) != here.get(name))
+    if names:
+        shown = ", ".join(f"{n} {saved.get(n)} (here {here.get(n)})" for n in names)
+        print(f"warning: {path} was written with {shown}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def _quiet_orbax() -> Iterator[None]:
+    """Orbax logs routine steps as warnings; the level is put back for everyone else."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,268 @@
+"""Checkpoints: what is saved comes back bit for bit; every fault is one cause and one cure."""
+
+import dataclasses
+import json
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import struct
+
+from cmrl_jax import checkpoint, config_io
+from cmrl_jax.config import Config, ConfigError
+
+
+@struct.dataclass
+class State:
+    """The kinds of leaf and node that a learner has."""
+
+    params: dict[str, jax.Array]
+    opt_state: Any
+    absent: jax.Array | None
+    nothing: tuple
+    no_elements: jax.Array
+    key: jax.Array
+    count: jax.Array
+    flags: jax.Array
+    lanes: int = struct.field(pytree_node=False)
+
+
+def init_state(seed: int = 0) -> State:
+    params = {"a.b/c": jnp.arange(6.0).reshape(2, 3) + seed, "w": jnp.float32(0.1 + seed)}
+    optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3))
+    return State(
+        params=params,
+        opt_state=optimizer.init(params),
+        absent=None,
+        nothing=(),
+        no_elements=jnp.zeros((0, 4)),
+        key=jax.random.split(jax.random.key(seed), 2),
+        count=jnp.int32(2**24 + 1 + seed),
+        flags=jnp.array([True, False]),
+        lanes=3,
+    )
+
+
+ABSTRACT = {"learner": jax.eval_shape(init_state), "replay": None, "context": None}
+
+
+def make_meta(iteration: int, **changes: Any) -> dict[str, Any]:
+    config = config_io.to_dict(Config())
+    numbers = {"env_steps": 10 * iteration, "wall_s": 1.5, "csv_offset": 123}
+    versions = {"jax": "0.12.0", "flax": "0.12.12"}
+    meta = {"config": config, "iteration": iteration, "versions": versions, "goals_sha256": "ab"}
+    return meta | numbers | changes
+
+
+def save_steps(run: Path, *steps: int, keep: int | None = None) -> None:
+    with checkpoint.full_store(run, keep) as store:
+        for step in steps:
+            trees = {"learner": init_state(step), "replay": None, "context": None}
+            assert store.save(trees, make_meta(step))
+
+
+def assert_equal_trees(found: Any, expected: Any) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape)
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            a, b = jax.random.key_data(a), jax.random.key_data(b)
+        np.testing.assert_array_equal(a, b)
+
+
+def restore(run: Path, **options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    with checkpoint.full_store(run, read_only=True) as store:
+        return store.restore(ABSTRACT, **options)
+
+
+def cause_and_cure(run: Path, **options: Any) -> tuple[str, str]:
+    with pytest.raises(ConfigError) as raised:
+        restore(run, **options)
+    return raised.value.cause, raised.value.cure
+
+
+def test_everything_comes_back_bit_for_bit(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = Path("runs") / "relative"
+    save_steps(run, 0, 7)
+    trees, meta = restore(run, config=Config())
+    assert_equal_trees(trees["learner"], init_state(7))
+    assert trees["replay"] is None and trees["context"] is None
+    assert trees["learner"].lanes == 3
+    assert meta == json.loads(json.dumps(make_meta(7)))
+    # The restored key draws what the saved one would have drawn.
+    drawn = jax.random.normal(trees["learner"].key[1], (3,))
+    np.testing.assert_array_equal(drawn, jax.random.normal(init_state(7).key[1], (3,)))
+    assert_equal_trees(restore(run, step=0)[0]["learner"], init_state(0))
+
+
+def test_rings_come_back_beside_the_learner(tmp_path):
+    rings = {"replay": {"rows": jnp.ones((3, 8, 2))}, "context": {"rows": jnp.zeros((3, 4, 2))}}
+    with checkpoint.full_store(tmp_path) as store:
+        store.save({"learner": init_state(), **rings}, make_meta(0))
+        trees, _ = store.restore(ABSTRACT | jax.eval_shape(lambda: rings))
+    assert_equal_trees(trees, {"learner": init_state(), **rings})
+
+
+def test_a_saved_buffer_may_be_donated_at_once(tmp_path):
+    """The background writer must not see what the next iteration writes into the buffer."""
+    rows = jax.random.normal(jax.random.key(0), (3, 50_000, 20))
+    expected = np.array(rows, copy=True)
+    overwrite = jax.jit(lambda x: x * 0.0, donate_argnums=0)
+    with checkpoint.full_store(tmp_path) as store:
+        store.save({"learner": init_state(), "replay": rows, "context": None}, make_meta(0))
+        jax.block_until_ready(overwrite(rows))
+        store.wait()
+        abstract = ABSTRACT | {"replay": jax.ShapeDtypeStruct(expected.shape, jnp.float32)}
+        trees, _ = store.restore(abstract)
+    np.testing.assert_array_equal(trees["replay"], expected)
+
+
+def test_the_newest_are_kept_and_policies_all(tmp_path):
+    save_steps(tmp_path, 1, 2, 5, 9, keep=2)
+    with checkpoint.full_store(tmp_path, read_only=True) as store:
+        assert store.steps() == [5, 9]
+    with checkpoint.policy_store(tmp_path) as store:
+        for step in (1, 2, 5, 9):
+            store.save({"policy": {"actor": jnp.full(2, step)}}, make_meta(step))
+    with checkpoint.policy_store(tmp_path, read_only=True) as store:
+        assert store.steps() == [1, 2, 5, 9]
+        abstract = {"policy": {"actor": jax.ShapeDtypeStruct((2,), jnp.int32)}}
+        trees, meta = store.restore(abstract, step=2)
+        np.testing.assert_array_equal(trees["policy"]["actor"], [2, 2])
+        assert (meta["iteration"], store.read_meta()["iteration"]) == (2, 9)
+
+
+def test_steps_only_go_forward(tmp_path):
+    trees = {"learner": init_state(), "replay": None, "context": None}
+    with checkpoint.full_store(tmp_path) as store:
+        assert store.save(trees, make_meta(4))
+        assert not store.save(trees, make_meta(4))
+        with pytest.raises(ValueError, match="3 comes after 4"):
+            store.save(trees, make_meta(3))
+
+
+def test_items_and_meta_are_the_stores_own(tmp_path):
+    trees = {"learner": init_state(), "replay": None, "context": None}
+    with checkpoint.full_store(tmp_path) as store:
+        with pytest.raises(ValueError, match="learner"):
+            store.save({"learner": init_state()}, make_meta(0))
+        with pytest.raises(ValueError, match="more"):
+            store.save(trees, make_meta(0, more=1))
+        with pytest.raises(TypeError, match="JSON"):
+            store.save(trees, make_meta(0, env_steps=np.int64(1)))
+        assert store.steps() == []
+
+
+def test_a_save_cut_short_leaves_the_one_before_and_is_swept(tmp_path):
+    save_steps(tmp_path, 1, 2)
+    cut = tmp_path / "ckpt" / "2.orbax-checkpoint-tmp"  # what kill -9 in a save was seen to leave
+    (tmp_path / "ckpt" / "2").rename(cut)
+    (cut / "learner" / "_METADATA").unlink()
+    trees, meta = restore(tmp_path)
+    assert meta["iteration"] == 1
+    assert_equal_trees(trees["learner"], init_state(1))
+    assert cut.exists(), "a reader must not touch a save that may be going on"
+    save_steps(tmp_path, 2)
+    assert not cut.exists()
+    assert_equal_trees(restore(tmp_path)[0]["learner"], init_state(2))
+
+
+def test_nothing_to_restore(tmp_path):
+    cause, cure = cause_and_cure(tmp_path)
+    assert cause == f"no checkpoint in {tmp_path / 'ckpt'}" and "--run" in cure
+    assert not (tmp_path / "ckpt").exists(), "a reader must not make directories"
+    (tmp_path / "ckpt").mkdir()
+    assert cause_and_cure(tmp_path)[0] == cause
+    save_steps(tmp_path, 3, 6)
+    assert "there are: 3, 6" in cause_and_cure(tmp_path, step=4)[1]
+
+
+# tensorstore's other reads fail too, after orbax has closed their event loop; only a message.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("victim", ["meta", "learner/_METADATA", "learner/manifest", "learner"])
+def test_a_damaged_checkpoint_names_the_way_back(tmp_path, victim):
+    save_steps(tmp_path, 1, 2)
+    step = tmp_path / "ckpt" / "2"
+    if victim == "learner/manifest":
+        for path in step.rglob("manifest.ocdbt"):
+            path.write_bytes(path.read_bytes()[:10])
+    elif victim == "meta":
+        (step / "meta" / "metadata").write_text("{", encoding="utf-8")
+    elif victim == "learner":
+        shutil.rmtree(step / "learner")
+    else:
+        (step / victim).unlink()
+    cause, cure = cause_and_cure(tmp_path)
+    assert str(step) in cause and "cannot be read" in cause and "\n" not in cause
+    assert cure == f"remove {step} to go on from 1"
+    shutil.rmtree(step)
+    assert restore(tmp_path)[1]["iteration"] == 1
+    shutil.rmtree(tmp_path / "ckpt" / "1" / "meta")
+    assert cause_and_cure(tmp_path)[1] == "start a new run"
+
+
+def test_a_meta_record_of_another_program_is_refused(tmp_path):
+    save_steps(tmp_path, 1)
+    path = tmp_path / "ckpt" / "1" / "meta" / "metadata"
+    path.write_text(json.dumps({"config": {}}), encoding="utf-8")
+    assert "other fields" in cause_and_cure(tmp_path)[0]
+
+
+def test_a_changed_setting_is_refused_by_name_before_any_array(tmp_path):
+    save_steps(tmp_path, 1)
+    shutil.rmtree(tmp_path / "ckpt" / "1" / "learner")
+    changed = dataclasses.replace(Config(), seed=5)
+    cause, cure = cause_and_cure(tmp_path, config=changed)
+    assert "seed: 0 -> 5" in cause and "config.yaml" in cure
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"count": jax.ShapeDtypeStruct((3,), jnp.int32)}, "count is int32[] there, int32[3] here"),
+        ({"count": jax.ShapeDtypeStruct((), jnp.float32)}, "int32[] there, float32[] here"),
+        ({"absent": jax.ShapeDtypeStruct((3,), jnp.int32)}, "absent is absent there"),
+        ({"flags": None}, "flags is bool[2] there, absent here"),
+    ],
+)
+def test_an_array_that_does_not_fit_is_named(tmp_path, change, message):
+    save_steps(tmp_path, 1)
+    abstract = ABSTRACT | {"learner": dataclasses.replace(ABSTRACT["learner"], **change)}
+    with checkpoint.full_store(tmp_path, read_only=True) as store:
+        with pytest.raises(ConfigError) as raised:
+            store.restore(abstract)
+    assert message in raised.value.cause and "version" in raised.value.cure
+
+
+def test_other_package_versions_warn_in_one_line(tmp_path, capsys):
+    save_steps(tmp_path, 1)
+    restore(tmp_path, versions={"jax": "0.12.0", "flax": "0.12.12"})
+    assert capsys.readouterr() == ("", "")
+    restore(tmp_path, versions={"jax": "0.13.0", "flax": "0.12.12"})
+    out, err = capsys.readouterr()
+    assert out == "" and len(err.splitlines()) == 1
+    assert "jax 0.12.0 (here 0.13.0)" in err and "flax" not in err
+
+
+def test_orbax_is_quiet_and_other_logging_is_not(tmp_path, caplog):
+    level = logging.getLogger("absl").level
+    save_steps(tmp_path, 1)
+    restore(tmp_path)
+    assert caplog.records == []
+    assert logging.getLogger("absl").level == level
+    logging.getLogger("absl").warning("still heard")
+    assert [record.message for record in caplog.records] == ["still heard"]
+
+
+def test_a_directory_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "ckpt").write_text("a file, where the directory should be")
+    with pytest.raises(ConfigError) as raised:
+        checkpoint.full_store(tmp_path)
+    assert "ckpt" in raised.value.cause and "--run" in raised.value.cure
