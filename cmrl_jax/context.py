@@ -79,8 +79,9 @@ class ContextInference:
         update_belief: (encoder_params, belief, transitions (..., time, .), mask (..., time), goal,
             goal_mask) -> Belief with those transitions added.
         posterior_of_belief: (encoder_params, belief, goal, goal_mask) -> Gaussian (..., latent).
-        sample_z: (key, Gaussian) -> z (..., latent), reparameterised; the mean without
-            information bottleneck.
+        z_of_noise: (Gaussian, standard normal (..., latent)) -> z (..., latent), reparameterised;
+            the mean without information bottleneck.
+        sample_z: (key, Gaussian) -> z (..., latent), the same with its own noise.
     """
 
     latent_dim: int
@@ -88,6 +89,7 @@ class ContextInference:
     posterior: Callable[..., Gaussian]
     update_belief: Callable[..., Belief]
     posterior_of_belief: Callable[..., Gaussian]
+    z_of_noise: Callable[[Gaussian, jax.Array], jax.Array]
     sample_z: Callable[[jax.Array, Gaussian], jax.Array]
 
 
@@ -147,11 +149,12 @@ def make_context_inference(cfg: Config, networks: Networks) -> ContextInference:
     def posterior_of_belief(encoder_params, belief, goal=None, goal_mask=None) -> Gaussian:
         return finalise(encoder_params, belief.sums, goal, goal_mask)
 
-    def sample_z(key: jax.Array, gaussian: Gaussian) -> jax.Array:
+    def z_of_noise(gaussian: Gaussian, noise: jax.Array) -> jax.Array:
         mean, variance = gaussian
-        if not encoder.information_bottleneck:
-            return mean
-        return mean + jnp.sqrt(variance) * jax.random.normal(key, mean.shape)
+        return mean + jnp.sqrt(variance) * noise if encoder.information_bottleneck else mean
+
+    def sample_z(key: jax.Array, gaussian: Gaussian) -> jax.Array:
+        return z_of_noise(gaussian, jax.random.normal(key, gaussian.mean.shape))
 
     return ContextInference(
         latent_dim=encoder.latent_dim,
@@ -159,32 +162,28 @@ def make_context_inference(cfg: Config, networks: Networks) -> ContextInference:
         posterior=posterior,
         update_belief=update_belief,
         posterior_of_belief=posterior_of_belief,
+        z_of_noise=z_of_noise,
         sample_z=sample_z,
     )
 
 
-def draw_context_mask(key: jax.Array, encoder: EncoderConfig, rows: int) -> jax.Array:
+def context_mask(u_length: jax.Array, u_empty: jax.Array, encoder: EncoderConfig) -> jax.Array:
     """Which of the N_max context transitions of every task row an update uses.
 
     N is log-uniform on 1..N_max (or N_max), and 0 with probability `p_empty` where there is a
     goal factor to train on an empty context.
 
+    Args:
+        u_length, u_empty: uniform on [0, 1), (task,).
+
     Returns:
         (task, context) of 0 and 1, the ones first.
     """
-    k_length, k_empty = jax.random.split(key)
     n_max = encoder.context_max
-    length = jnp.full((rows,), n_max)
+    length = jnp.full(u_length.shape, n_max)
     if encoder.context_len == "random":
-        u = jax.random.uniform(k_length, (rows,))
-        length = jnp.floor(jnp.exp(u * math.log(n_max + 1))).astype(jnp.int32)
+        length = jnp.floor(jnp.exp(u_length * math.log(n_max + 1))).astype(jnp.int32)
         length = jnp.clip(length, 1, n_max)  # rounding of exp at both ends
     if encoder.goal_fusion in ("factor", "both"):
-        is_empty = jax.random.bernoulli(k_empty, encoder.p_empty, (rows,))
-        length = jnp.where(is_empty, 0, length)
-    return (jnp.arange(n_max) < length[:, None]).astype(jnp.float32)
-
-
-def draw_goal_mask(key: jax.Array, encoder: EncoderConfig, rows: int) -> jax.Array:
-    """0 for the task rows whose text an update hides (probability `p_drop_goal`), else 1."""
-    return jax.random.bernoulli(key, 1.0 - encoder.p_drop_goal, (rows,)).astype(jnp.float32)
+        length = jnp.where(u_empty < encoder.p_empty, 0, length)
+    return (jnp.arange(n_max) < length[..., None]).astype(jnp.float32)

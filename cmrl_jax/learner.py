@@ -9,21 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from cmrl_jax import normalizers, replay
 from cmrl_jax.config import Config, lanes_per_task
-from cmrl_jax.context import (
-    ContextInference,
-    draw_context_mask,
-    draw_goal_mask,
-    make_context_inference,
-)
+from cmrl_jax.context import ContextInference, context_mask, make_context_inference
 from cmrl_jax.distributions import sample_tanh_gaussian
 from cmrl_jax.networks import Networks, Params, Routing, make_networks
 from cmrl_jax.objectives import (
@@ -34,6 +29,7 @@ from cmrl_jax.objectives import (
     Objectives,
     make_objectives,
 )
+from cmrl_jax.optimizers import adam_step, init_adam, polyak
 
 
 @struct.dataclass
@@ -95,26 +91,6 @@ class Learner:
     task_conditioning: Callable[[jax.Array], jax.Array]
 
 
-def clip_by_norm(grads: Any, max_norm: float, stacked: bool) -> tuple[Any, jax.Array]:
-    """Scales gradients to a global norm of at most `max_norm` (0: leaves them alone).
-
-    Args:
-        stacked: the leaves have a leading axis of networks, each with its own norm.
-
-    Returns:
-        The gradients and the norm before clipping, (network,) if stacked, else ().
-    """
-    norm = jax.vmap(optax.tree.norm)(grads) if stacked else optax.tree.norm(grads)
-    if max_norm == 0:
-        return grads, norm
-    scale = jnp.minimum(1.0, max_norm / jnp.maximum(norm, 1e-12))
-
-    def rescale(g: jax.Array) -> jax.Array:
-        return g * scale.reshape(scale.shape + (1,) * (g.ndim - scale.ndim))
-
-    return jax.tree.map(rescale, grads), norm
-
-
 def per_task(rows: jax.Array, task_ids: jax.Array, num_tasks: int) -> jax.Array:
     """Mean over the rows of each task, (row,) -> (T,); NaN for a task without a row."""
     one_hot = jax.nn.one_hot(task_ids, num_tasks)  # (row, T)
@@ -144,7 +120,7 @@ def make_learner(
     inference = make_context_inference(cfg, networks) if has_encoder else None
     objectives = make_objectives(cfg, networks, inference, action_size)
     has_value = sac.variant == "v"
-    optimizer = optax.adam(sac.lr)
+    latent_dim = inference.latent_dim if inference else 0
 
     def normalize_obs(obs_stats: Any, obs: jax.Array) -> jax.Array:
         return normalizers.normalize_obs(obs_stats, obs) if sac.normalize_obs else obs
@@ -171,9 +147,6 @@ def make_learner(
         def copy(params: Any) -> Any:  # a donated state must not hold one buffer twice
             return jax.tree.map(jnp.copy, params)
 
-        def init_optimizer(params: Any) -> Any:
-            return None if params is None else optimizer.init(params)
-
         return TrainState(
             actor_params=actor_params,
             critic_params=critic_params,
@@ -182,11 +155,11 @@ def make_learner(
             target_value_params=copy(value_params) if has_value else None,
             encoder_params=encoder_params,
             log_alpha=log_alpha,
-            actor_opt_state=init_optimizer(actor_params),
-            critic_opt_state=init_optimizer(critic_params),
-            value_opt_state=init_optimizer(value_params),
-            encoder_opt_state=init_optimizer(encoder_params),
-            alpha_opt_state=init_optimizer(log_alpha if sac.alpha != "fixed" else None),
+            actor_opt_state=init_adam(actor_params),
+            critic_opt_state=init_adam(critic_params, stacked=True),
+            value_opt_state=init_adam(value_params),
+            encoder_opt_state=init_adam(encoder_params),
+            alpha_opt_state=init_adam(log_alpha if sac.alpha != "fixed" else None),
             obs_stats=normalizers.init_obs_stats(obs_size),
             return_stats=normalizers.init_return_stats(num_tasks, lanes_per_task(cfg)),
             gradient_steps=jnp.zeros((), jnp.int32),
@@ -196,11 +169,14 @@ def make_learner(
     def draw_minibatch(
         state: TrainState, replay_state: Any, context_state: Any, key: jax.Array
     ) -> Minibatch:
-        k_ids, k_batch, k_context, k_length, k_paraphrase, k_goal = jax.random.split(key, 6)
+        # Few large draws: every call of the generator costs a CPU more than its numbers do.
+        k_ids, k_batch, k_context, k_uniform, k_normal = jax.random.split(key, 5)
         task_ids = jnp.arange(num_tasks)
         if sac.task_rows:
             task_ids = jax.random.randint(k_ids, (sac.task_rows,), 0, num_tasks)
-        rows = task_ids.shape[0]
+        rows, actions = task_ids.shape[0], sac.batch * action_size
+        noise = jax.random.normal(k_normal, (rows, 2 * actions + latent_dim))
+        action_noise = noise[:, : 2 * actions].reshape(rows, 2, sac.batch, action_size)
         batch = replay.sample(replay_state, k_batch, task_ids, sac.batch, sac.n_step, sac.gamma)
         scale = sac.reward_scale / normalizers.reward_denominator(state.return_stats, sac)
         data = Minibatch(
@@ -210,6 +186,8 @@ def make_learner(
             reward=batch.reward * scale[task_ids, None],
             discount=batch.discount,
             next_obs=normalize_obs(state.obs_stats, batch.next_obs),
+            next_noise=action_noise[:, 0],
+            action_noise=action_noise[:, 1],
         )
         if not has_encoder:
             return data
@@ -218,39 +196,33 @@ def make_learner(
             context = replay.sample_transitions(replay_state, k_context, task_ids, n_max)
         else:
             context = replay.sample_context(context_state, k_context, task_ids, n_max)
-        paraphrase = jax.random.randint(k_paraphrase, (rows,), 0, goal_vectors.shape[1])
+        u_length, u_empty, u_goal, u_text = jax.random.uniform(k_uniform, (4, rows))
+        paraphrase = (u_text * goal_vectors.shape[1]).astype(jnp.int32)
         return data._replace(
             context=replace(
                 context,
                 obs=normalize_obs(state.obs_stats, context.obs),
                 next_obs=normalize_obs(state.obs_stats, context.next_obs),
             ),
-            context_mask=draw_context_mask(k_length, cfg.encoder, rows),
+            context_mask=context_mask(u_length, u_empty, cfg.encoder),
             goal=goal_vectors[task_ids, paraphrase],
-            goal_mask=draw_goal_mask(k_goal, cfg.encoder, rows),
+            goal_mask=(u_goal >= cfg.encoder.p_drop_goal).astype(jnp.float32),
+            z_noise=noise[:, 2 * actions :],
         )
 
-    def step(grads: Any, opt_state: Any, params: Params, stacked: bool = False):
-        """One clipped Adam step -> params, opt_state, norm before clipping."""
-        grads, norm = clip_by_norm(grads, sac.grad_clip, stacked)
-        updates, opt_state = optimizer.update(grads, opt_state, params)
-        return optax.apply_updates(params, updates), opt_state, norm
-
-    def polyak(online: Any, target: Any) -> Any:
-        return jax.tree.map(lambda new, old: old + sac.tau * (new - old), online, target)
+    step = partial(adam_step, lr=sac.lr, max_norm=sac.grad_clip)
 
     def update(
         state: TrainState, replay_state: Any, context_state: Any, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
-        k_data, k_critic, k_actor = jax.random.split(key, 3)
-        data = draw_minibatch(state, replay_state, context_state, k_data)
+        data = draw_minibatch(state, replay_state, context_state, key)
         norms = {}
 
         trained = CriticSide(state.critic_params, state.encoder_params)
         target_params = state.target_value_params if has_value else state.target_critic_params
         critic_grad = jax.grad(objectives.critic, has_aux=True)
         grads, (zc, critic_metrics) = critic_grad(
-            trained, state.actor_params, target_params, state.log_alpha, data, k_critic
+            trained, state.actor_params, target_params, state.log_alpha, data
         )
         critic_params, critic_opt_state, norms["critic"] = step(
             grads.critic, state.critic_opt_state, state.critic_params, stacked=True
@@ -265,7 +237,7 @@ def make_learner(
         trained = ActorSide(state.actor_params, state.value_params)
         actor_grad = jax.grad(objectives.actor, has_aux=True)
         grads, (log_prob, actor_metrics) = actor_grad(
-            trained, critic_params, zc, state.log_alpha, data, k_actor
+            trained, critic_params, zc, state.log_alpha, data
         )
         params, opt_state, norms["actor"] = step(
             grads.actor, state.actor_opt_state, state.actor_params
@@ -275,24 +247,24 @@ def make_learner(
             params, opt_state, norms["value"] = step(
                 grads.value, state.value_opt_state, state.value_params
             )
-            target = polyak(params, state.target_value_params)
+            target = polyak(params, state.target_value_params, sac.tau)
             new = replace(
                 new, value_params=params, value_opt_state=opt_state, target_value_params=target
             )
         else:
-            target = polyak(critic_params, state.target_critic_params)
+            target = polyak(critic_params, state.target_critic_params, sac.tau)
             new = replace(new, target_critic_params=target)
 
         if sac.alpha != "fixed":
             grad = jax.grad(objectives.alpha)(state.log_alpha, log_prob, data.task_ids)
-            norms["alpha"] = optax.tree.norm(grad)
-            updates, opt_state = optimizer.update(grad, state.alpha_opt_state)
-            log_alpha = optax.apply_updates(state.log_alpha, updates)
+            log_alpha, opt_state, norms["alpha"] = adam_step(
+                grad, state.alpha_opt_state, state.log_alpha, sac.lr, max_norm=0.0
+            )
             new = replace(new, log_alpha=log_alpha, alpha_opt_state=opt_state)
 
         new = replace(new, gradient_steps=state.gradient_steps + 1)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(norm)) for norm in norms.values()]))
-        new = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new, state)
+        new = jax.lax.cond(finite, lambda: new, lambda: state)
         skipped = 1 - finite.astype(jnp.int32)
         new = replace(new, skipped_updates=state.skipped_updates + skipped)
 

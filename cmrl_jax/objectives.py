@@ -32,10 +32,12 @@ class Minibatch(NamedTuple):
         action: (task, batch, act).
         reward: n-step discounted sum in critic units, (task, batch).
         discount: gamma^n (1 - term), (task, batch).
+        next_noise, action_noise: standard normal draws of the two actions, (task, batch, act).
         context: raw rewards, (task, context, ...); None without an encoder, as all that follow.
         context_mask: (task, context).
         goal: text vector, (task, G).
         goal_mask: (task,).
+        z_noise: standard normal draw of z, (task, latent).
     """
 
     task_ids: jax.Array
@@ -44,10 +46,13 @@ class Minibatch(NamedTuple):
     reward: jax.Array
     discount: jax.Array
     next_obs: jax.Array
+    next_noise: jax.Array
+    action_noise: jax.Array
     context: Transitions | None = None
     context_mask: jax.Array | None = None
     goal: jax.Array | None = None
     goal_mask: jax.Array | None = None
+    z_noise: jax.Array | None = None
 
 
 class CriticSide(NamedTuple):
@@ -66,15 +71,15 @@ class ActorSide(NamedTuple):
 
 @dataclass(frozen=True)
 class Objectives:
-    """Pure functions; per-row metrics have the shape (task,), the others ().
+    """Pure functions, all randomness in the minibatch. Per-row metrics are (task,), others ().
 
     Attributes:
-        infer: (encoder_params, Minibatch, key) -> conditioning zc (task, conditioning) and KL nats
+        infer: (encoder_params, Minibatch) -> conditioning zc (task, conditioning) and KL nats
             (task, latent) or None.
-        critic: (CriticSide, actor_params, target_params, log_alpha, Minibatch, key) -> loss,
-            (zc, metrics). `target_params` are the target critics' or the target V network's.
-        actor: (ActorSide, critic_params, zc, log_alpha, Minibatch, key) -> loss, (log_prob
-            (task, batch), metrics).
+        critic: (CriticSide, actor_params, target_params, log_alpha, Minibatch) -> loss, (zc,
+            metrics). `target_params` are the target critics' or the target V network's.
+        actor: (ActorSide, critic_params, zc, log_alpha, Minibatch) -> loss, (log_prob (task,
+            batch), metrics).
         alpha: (log_alpha (T,), log_prob, task_ids) -> loss.
     """
 
@@ -109,10 +114,8 @@ def make_objectives(
     is_categorical = model.critic == "c51"
     support = losses.critic_support(model.critic_v_max, model.critic_bins)
 
-    def infer(
-        encoder_params: Params, data: Minibatch, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array | None]:
-        if inference is None:
+    def infer(encoder_params: Params | None, data: Minibatch) -> tuple[jax.Array, jax.Array | None]:
+        if inference is None or data.z_noise is None:
             if model.conditioning == "task_id":
                 return jax.nn.one_hot(data.task_ids, networks.conditioning_size), None
             return jnp.zeros((data.task_ids.shape[0], 0)), None
@@ -120,23 +123,22 @@ def make_objectives(
             encoder_params, data.context, data.context_mask, data.goal, data.goal_mask
         )
         kl = kl_to_standard_normal(posterior) if cfg.encoder.information_bottleneck else None
-        return inference.sample_z(key, posterior), kl
+        return inference.z_of_noise(posterior, data.z_noise), kl
 
-    def act(actor_params: Params, obs: jax.Array, zb: jax.Array, key: jax.Array):
+    def act(actor_params: Params, obs: jax.Array, zb: jax.Array, noise: jax.Array):
         mean, log_std, routing = networks.actor(actor_params, obs, zb[:, None])
-        noise = jax.random.normal(key, mean.shape)
         action, log_prob = sample_tanh_gaussian(mean, log_std, noise)
         return action, log_prob, (mean, log_std, routing)
 
     def expected_q(head: jax.Array) -> jax.Array:
         return jax.nn.softmax(head, axis=-1) @ support if is_categorical else head
 
-    def critic_target(actor_params, target_params, alpha, zb, data: Minibatch, key):
+    def critic_target(actor_params, target_params, alpha, zb, data: Minibatch):
         """The target, (task, batch) or (task, batch, bin), and its clipped share."""
         if sac.variant == "v":
             next_value = networks.value(target_params, data.next_obs, zb[:, None])
             return losses.td_target(data.reward, data.discount, next_value), None
-        next_action, next_log_prob, _ = act(actor_params, data.next_obs, zb, key)
+        next_action, next_log_prob, _ = act(actor_params, data.next_obs, zb, data.next_noise)
         next_head = networks.critic(target_params, data.next_obs, next_action, zb[:, None])
         if is_categorical:
             return losses.categorical_target(
@@ -151,13 +153,11 @@ def make_objectives(
         next_value = losses.soft_value(next_head, next_log_prob, alpha)
         return losses.td_target(data.reward, data.discount, next_value), None
 
-    def critic(trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch, key):
-        k_z, k_act = jax.random.split(key)
-        zc, kl = infer(trained.encoder, data, k_z)
+    def critic(trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
+        zc, kl = infer(trained.encoder, data)
         alpha = jnp.exp(log_alpha)[data.task_ids]
-        target, clipped = critic_target(
-            actor_params, target_params, alpha, stop_gradient(zc), data, k_act
-        )
+        zb = stop_gradient(zc)
+        target, clipped = critic_target(actor_params, target_params, alpha, zb, data)
         head = networks.critic(trained.critic, data.obs, data.action, zc[:, None])
         loss_of = losses.categorical_critic_loss if is_categorical else losses.critic_loss
         td_loss = loss_of(head, target)
@@ -173,10 +173,12 @@ def make_objectives(
             metrics["active_dims"] = jnp.sum(jnp.mean(kl, axis=0) > 0.05).astype(jnp.float32)
         return loss, (zc, metrics)
 
-    def actor(trained: ActorSide, critic_params, zc, log_alpha, data: Minibatch, key):
+    def actor(trained: ActorSide, critic_params, zc, log_alpha, data: Minibatch):
         zb = stop_gradient(zc)
         alpha = jnp.exp(log_alpha)[data.task_ids]
-        action, log_prob, (mean, log_std, routing) = act(trained.actor, data.obs, zb, key)
+        action, log_prob, (mean, log_std, routing) = act(
+            trained.actor, data.obs, zb, data.action_noise
+        )
         q = expected_q(networks.critic(critic_params, data.obs, action, zb[:, None]))
         row_loss = losses.actor_loss(q, log_prob, alpha)
         if sac.policy_reg:
