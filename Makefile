@@ -27,7 +27,7 @@ bench: $(STAMP)
 	$(PY) train.py bench --json bench.json $(ARGS)
 
 parity: $(STAMP)
-	$(PY) -m envs.parity --json parity.json $(ARGS)
+	$(PY) -m envs.parity --policies --json parity.json $(ARGS)
 
 # The newest versions: make lock ARGS=--upgrade. Names and versions only, the same for 3.12 and
 # 3.13 (checked by a dry run for each that uv finds); the cuda extra stays outside.
