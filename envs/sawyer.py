@@ -44,6 +44,7 @@ class State:
     success: jax.Array  # () bool, at this very step
     distance: jax.Array  # () metres between object and target, the quantity success is judged by
     steps: jax.Array  # () int32, control steps since the reset
+    faults: jax.Array  # () int32, times the physics became non-finite and was put back to the start
 
 
 class _TaskData:
@@ -120,13 +121,7 @@ class Ml4Env:
         """A fresh episode with the fixture at `placement` (3,), a goal of a named goal set."""
         tasks = self.tasks
         task_id = jnp.asarray(task_id, jnp.int32)
-        physics = PhysicsState(
-            qpos=tasks.qpos[task_id].at[SLIDE].set(tasks.start_slide[task_id]),
-            qvel=tasks.qvel[task_id],
-            warm_start=tasks.warm_start[task_id],
-            mocap=tasks.hand_start[task_id],
-            placement=jnp.asarray(placement, jnp.float32),
-        )
+        physics = self._start(task_id, placement)
         fixture = self.physics.scene(self._scene_id[task_id]).fixture
         shown = physics.placement + fixture.offset + fixture.axis * tasks.first_obs_slide[task_id]
         frame = self._frame(tasks.hand[task_id], tasks.opening[task_id], shown, task_id)
@@ -141,6 +136,7 @@ class Ml4Env:
             success=jnp.zeros((), bool),
             distance=zero,
             steps=jnp.zeros((), jnp.int32),
+            faults=jnp.zeros((), jnp.int32),
         )
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -151,6 +147,10 @@ class Ml4Env:
         ctrl = jnp.stack([action[3], -action[3]])
         scene = self._scene_id[state.task_id]
         physics = self.physics.step(state.physics.replace(mocap=mocap), ctrl, scene)
+        is_finite = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
+        start = self._start(state.task_id, physics.placement)
+        physics = jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), physics, start)
+        state = state.replace(faults=state.faults + 1 - is_finite.astype(jnp.int32))
         positions = self.physics.positions(physics, scene)
         return self.observe(state, physics, positions, action)
 
@@ -188,6 +188,17 @@ class Ml4Env:
             distance=pick(1),
             success=pick(2),
             steps=state.steps + 1,
+        )
+
+    def _start(self, task_id: jax.Array, placement: jax.Array) -> PhysicsState:
+        """The settled physics state with the fixture at `placement` (3,)."""
+        tasks = self.tasks
+        return PhysicsState(
+            qpos=tasks.qpos[task_id].at[SLIDE].set(tasks.start_slide[task_id]),
+            qvel=tasks.qvel[task_id],
+            warm_start=tasks.warm_start[task_id],
+            mocap=tasks.hand_start[task_id],
+            placement=jnp.asarray(placement, jnp.float32),
         )
 
     def _target(self, physics: PhysicsState, task_id: jax.Array) -> jax.Array:

@@ -1,0 +1,341 @@
+"""The host loop: iterations, console and CSV, periodic evaluation, checkpoints, signals.
+
+Everything numerical happens in two compiled programs (a training iteration, an evaluation episode);
+this file only decides when, and writes things down. NOTE: this is the one impure layer.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from cmrl_jax.checkpoint import full_store, policy_store
+from cmrl_jax.collect import (
+    RunState,
+    init_run,
+    make_train_iteration,
+    metric_names,
+    metric_row,
+)
+from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config_io import to_yaml
+from cmrl_jax.evaluate import summarise
+from cmrl_jax.metrics import (
+    LEADING_COLUMNS,
+    Console,
+    MetricsCsv,
+    TensorBoard,
+    format_duration,
+    format_evaluation,
+    format_iteration,
+    package_versions,
+    write_versions,
+)
+from cmrl_jax.session import Session, policy_params, prepare_jax
+
+EVAL_FIGURES = ("success_any", "success_last", "return")
+
+
+class StopSignal:
+    """SIGINT or SIGTERM: the first asks the loop to stop at the next border, the second stops."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._old = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def _handle(self, number: int, frame: Any) -> None:
+        if self.requested:
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        self.requested = True
+        print("stopping at the end of this iteration; once more to stop at once", flush=True)
+
+    def restore(self) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """When a run ends and when it is evaluated, in iterations; a function of the config alone.
+
+    So two runs of one config evaluate at the same iterations, whatever the machine's speed.
+    """
+
+    steps_per_iteration: int
+    iterations: int | None  # None: limited by time alone
+    eval_interval: int
+
+    @classmethod
+    def of(cls, config: Config) -> Schedule:
+        steps = config.collect.lanes * config.env.horizon
+        total = math.ceil(config.train.env_steps / steps) if config.train.env_steps else None
+        tasks = len(config.tasks.train) + len(config.tasks.test)
+        episodes = max(config.eval.k) + 1
+        eval_steps = episodes * config.eval.goals * tasks * config.env.horizon
+        # Evaluation steps cost no more than training steps (which carry gradient steps too), so
+        # this bound on steps keeps evaluation within its share of the wall time.
+        interval = math.ceil(eval_steps / (config.eval.wall_share * steps))
+        if total is not None:
+            interval = max(interval, math.ceil(config.eval.every * total))
+        return cls(steps, total, interval)
+
+    def is_eval_due(self, iterations_done: int) -> bool:
+        return iterations_done % self.eval_interval == 0
+
+
+def train(config: Config, run_dir: Path, resume: bool = False) -> int:
+    """Trains to the end of the schedule or to a signal; returns the exit code.
+
+    Raises:
+        ConfigError: anything the user can mend, before the first compile where possible.
+    """
+    stop = StopSignal()
+    try:
+        with full_store(run_dir, config.checkpoint.keep) as full, policy_store(run_dir) as policy:
+            return _Run(config, run_dir, full, policy, stop).go(resume)
+    finally:
+        stop.restore()
+
+
+class _Run:
+    """One process's share of a run."""
+
+    def __init__(self, config: Config, run_dir: Path, full: Any, policy: Any, stop: StopSignal):
+        self.config, self.run_dir, self.stop = config, run_dir, stop
+        self.full, self.policy = full, policy
+        self.schedule = Schedule.of(config)
+        self.console = Console(config.log.progress)
+        self.say = self.console.line
+
+    def go(self, resume: bool) -> int:
+        self.say(f"device: {prepare_jax(self.config)}")
+        self.session = Session(self.config)
+        iteration = make_train_iteration(
+            self.config,
+            self.session.env,
+            self.session.learner,
+            self.session.train_goals,
+            self.session.train_placements(),
+        )
+        # Jitted, so that every leaf has a buffer of its own: the iteration donates them all.
+        self.init = jax.jit(lambda key: init_run(self.config, self.session.learner, key))
+        abstract = jax.eval_shape(self.init, jax.random.key(0))
+        metrics = jax.eval_shape(iteration, abstract)[1]
+        self.start(abstract, self.columns(metrics), resume)
+        try:
+            if self.iterations_left() and not self.stop.requested:
+                self.compile(iteration)
+            while self.iterations_left() and not self.stop.requested:
+                self.step()
+            self.save()
+            if self.stop.requested:
+                self.say(
+                    f"stopped after iteration {self.done}; go on with: {self.resume_command()}"
+                )
+                return 0
+            return self.finish()
+        finally:
+            self.csv.close()
+            self.console.close()
+            if self.tensorboard is not None:
+                self.tensorboard.close()
+
+    def columns(self, metrics: dict[str, Any]) -> list[str]:
+        config, tasks = self.config, self.session.eval_tasks
+        evals = [f"eval/{t}/k{k}/{f}" for t in tasks for k in config.eval.k for f in EVAL_FIGURES]
+        times = ["time/iteration_s", "time/env_steps_per_s", "time/evaluation_s"]
+        return [*LEADING_COLUMNS, *metric_names(metrics, config.tasks.train), *evals, *times]
+
+    def start(self, abstract: RunState, columns: list[str], resume: bool) -> None:
+        """A new state, saved before its first iteration, or the state of the last checkpoint."""
+        csv_path = self.run_dir / "metrics.csv"
+        config = self.config
+        if resume and self.full.steps():
+            trees, meta = self.full.restore(
+                self.trees(abstract), config=config, versions=package_versions()
+            )
+            self.check_goals(meta)
+            learner = trees["learner"]
+            self.state = RunState(
+                learner=learner["state"],
+                replay=trees["replay"],
+                context=trees["context"],
+                key=learner["key"],
+                iteration=learner["iteration"],
+            )
+            self.done, self.wall = meta["iteration"], meta["wall_s"]
+            self.csv = MetricsCsv(csv_path, columns, offset=meta["csv_offset"])
+            self.say(f"resuming {self.run_dir} after iteration {self.done}")
+        else:
+            if resume:
+                self.say(f"{self.run_dir} was stopped before its first save: starting it anew")
+            self.state = self.init(jax.random.key(config.seed))
+            self.done, self.wall = 0, 0.0
+            self.csv = MetricsCsv(csv_path, columns)
+        (self.run_dir / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
+        write_versions(self.run_dir / "versions.json")
+        self.tensorboard = None
+        if config.log.tensorboard:
+            resume_at = self.done * self.schedule.steps_per_iteration if resume else None
+            self.tensorboard = TensorBoard(self.run_dir / "tensorboard", resume_at)
+        self.evaluator = self.session.evaluator()
+        self.clock = time.monotonic() - self.wall
+        self.save()
+
+    def check_goals(self, meta: dict[str, Any]) -> None:
+        if meta["goals_sha256"] != self.session.goals.sha256:
+            raise ConfigError(
+                f"{self.run_dir} was trained with another goal table ({meta['goals_sha256'][:12]})",
+                "put that table back, or start a new run",
+            )
+
+    def compile(self, iteration: Any) -> None:
+        started = time.monotonic()
+        self.say("compiling the training iteration ...")
+        jitted = jax.jit(iteration, donate_argnums=0)
+        self.iteration = jitted.lower(self.state).compile()
+        self.say(f"compiling the training iteration took {time.monotonic() - started:.1f} s")
+
+    def iterations_left(self) -> bool:
+        minutes, total = self.config.train.minutes, self.schedule.iterations
+        in_time = not minutes or self.wall < 60 * minutes
+        return in_time and (total is None or self.done < total)
+
+    def step(self) -> None:
+        """One iteration, its row, and whatever is due after it."""
+        config, started = self.config, time.monotonic()
+        self.state, metrics = self.iteration(self.state)
+        metrics = jax.tree.map(np.asarray, metrics)
+        seconds = time.monotonic() - started
+        self.done += 1
+        steps = self.done * self.schedule.steps_per_iteration
+        row: dict[str, Any] = {
+            "iteration": self.done - 1,
+            "env_steps": steps,
+            "gradient_steps": int(self.state.learner.gradient_steps),
+            "seed": config.seed,
+            "time/iteration_s": seconds,
+            "time/env_steps_per_s": self.schedule.steps_per_iteration / seconds,
+        } | metric_row(metrics, config.tasks.train)
+        self.check_health(row)
+        if self.schedule.is_eval_due(self.done):
+            row |= self.evaluate()
+        self.wall = time.monotonic() - self.clock
+        row["wall_s"] = self.wall
+        self.csv.write(row)
+        if self.tensorboard is not None:
+            self.tensorboard.write(row)
+        self.say(format_iteration(row, config.tasks.train, self.seconds_left()))
+        if evaluation := format_evaluation(row):
+            self.say(evaluation)
+        self.console.advance(self.share_done())
+        if self.wall - self.saved_at >= 60 * config.checkpoint.minutes:
+            self.save()
+
+    def check_health(self, row: dict[str, Any]) -> None:
+        """Stops a run whose every gradient step was skipped: it cannot recover by itself."""
+        if row.get("train/skipped") == 1.0:
+            raise ConfigError(
+                f"iteration {row['iteration']}: every gradient was non-finite",
+                f"lower sac.lr, then go on from the last good checkpoint: {self.resume_command()}",
+            )
+        if row["train/physics_faults"]:
+            count = int(row["train/physics_faults"])
+            self.say(f"warning: {count} lane(s) left the range of float32 and were put back")
+
+    def evaluate(self) -> dict[str, Any]:
+        """Columns of a periodic evaluation: few goals, few k, all tasks."""
+        started, evaluation = time.monotonic(), self.config.eval
+        summary = self.scores(evaluation.goals, evaluation.k)
+        row: dict[str, Any] = {
+            f"eval/{task}/k{k}/{figure}": figures[figure]
+            for task, by_k in summary.items()
+            for k, figures in by_k.items()
+            for figure in EVAL_FIGURES
+        }
+        return row | {"time/evaluation_s": time.monotonic() - started}
+
+    def scores(self, goals: int, k: tuple[int, ...]) -> dict[str, Any]:
+        params = policy_params(self.state.learner)
+        placements = self.session.placements(self.config.eval.goal_set, goals)
+        scores = self.evaluator.run(params, placements, k, self.config.eval.seed)
+        return summarise(scores, self.session.eval_tasks)
+
+    def share_done(self) -> float:
+        total, minutes = self.schedule.iterations, self.config.train.minutes
+        shares = [self.done / total] if total else []
+        if minutes:
+            shares.append(self.wall / (60 * minutes))
+        return max(shares, default=0.0)
+
+    def seconds_left(self) -> float:
+        share = self.share_done()
+        return self.wall * (1 - share) / share if share else math.inf
+
+    def trees(self, state: RunState) -> dict[str, Any]:
+        learner = {"state": state.learner, "key": state.key, "iteration": state.iteration}
+        return {"learner": learner, "replay": state.replay, "context": state.context}
+
+    def save(self) -> None:
+        """A full checkpoint of this border, and a policy checkpoint where one is due."""
+        self.saved_at = self.wall
+        meta = {
+            "config": dataclasses.asdict(self.config),
+            "iteration": self.done,
+            "env_steps": self.done * self.schedule.steps_per_iteration,
+            "wall_s": self.wall,
+            "csv_offset": self.csv.offset,
+            "versions": package_versions(),
+            "goals_sha256": self.session.goals.sha256,
+        }
+        self.full.save(self.trees(self.state), meta)
+        is_last = self.stop.requested or not self.iterations_left()
+        if self.done and (is_last or self.done % self.config.checkpoint.policy_every == 0):
+            policy = {
+                "params": policy_params(self.state.learner),
+                "goal_vectors": self.session.goals.vectors[:, 0],
+            }
+            self.policy.save({"policy": policy}, meta)
+            self.policy.wait()
+        # The next iteration donates these very buffers, and on the CPU a host copy is a view.
+        self.full.wait()
+
+    def finish(self) -> int:
+        """The final evaluation: more goals, every k, written beside the CSV."""
+        evaluation = self.config.eval
+        summary = self.scores(evaluation.final_goals, evaluation.final_k)
+        result = {
+            "tasks": summary,
+            "goals": evaluation.final_goals,
+            "goal_set": evaluation.goal_set,
+            "horizon": self.evaluator.horizon,
+            "iteration": self.done,
+            "seed": evaluation.seed,
+        }
+        (self.run_dir / "eval.json").write_text(json.dumps(result, indent=2) + "\n")
+        self.say(format_scores(summary))
+        self.say(f"done in {format_duration(self.wall)}: {self.run_dir}")
+        return 0
+
+    def resume_command(self) -> str:
+        return f"python train.py --run {self.run_dir} --resume"
+
+
+def format_scores(summary: dict[str, Any]) -> str:
+    """A table of an evaluation: success at any and last step and return, per task and k."""
+    lines = [f"{'task':<14} {'k':>3} {'any step':>9} {'last step':>9} {'return':>8}"]
+    for task, by_k in summary.items():
+        for k, f in by_k.items():
+            figures = f"{f['success_any']:>9.2f} {f['success_last']:>9.2f} {f['return']:>8.0f}"
+            lines.append(f"{task:<14} {k:>3} {figures}")
+    return "\n".join(lines)

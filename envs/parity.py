@@ -1,0 +1,179 @@
+"""How far the port is from Meta-World: `python -m envs.parity`.
+
+Five parts, each against the environment objects of the `metaworld` package: (1) observation, reward
+and success in injected states, (2) one control step from them, (3) recorded actions replayed,
+(4) scripted policies in closed loop, (5) start observations. It reports and does not judge: the
+exit code is 0 whenever it could measure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from envs.goal_sets import GOALS, load_goal_set
+
+DEFAULT_NOISE = 0.3  # of the second closed-loop run when all parts are measured
+STATE_GOALS = 10  # parts 1 to 3 take their states from at most so many goals a task
+MAX_HORIZON = 500  # Meta-World's own limit
+_LARGEST_SEED = 2**32 - 1
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message}\nsee: python -m envs.parity --help")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="python -m envs.parity",
+        description="Measures this port of Meta-World's ML4 tasks against Meta-World itself.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--policies", action="store_true", help="part 4 only: scripted policies")
+    parser.add_argument("--physics", default="mjx", metavar="mjx|native", help="backend [mjx]")
+    parser.add_argument("--goals", type=int, default=10, metavar="N", help="goals a task [10]")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        metavar="S",
+        help="of the noise [0]; without --goal-set also of the goals: fresh:S",
+    )
+    parser.add_argument("--goal-set", metavar="NAME", help="train, heldout or fresh:S [heldout]")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        metavar="X",
+        help=f"action noise of part 4 [0; all parts: 0 and {DEFAULT_NOISE}]",
+    )
+    parser.add_argument(
+        "--horizon", type=int, default=200, metavar="H", help="control steps an episode [200]"
+    )
+    parser.add_argument("--json", type=Path, metavar="F", help="write the figures there, too")
+    return parser
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Raises ValueError (cause, cure) for what the parser cannot see."""
+    if args.physics == "native":
+        raise ValueError("the physics backend 'native' is not built yet\nuse --physics mjx")
+    if args.physics != "mjx":
+        raise ValueError(f"unknown physics backend '{args.physics}'\nuse --physics mjx")
+    if not 1 <= args.goals <= GOALS:
+        raise ValueError(f"a goal set holds {GOALS} goals a task, --goals {args.goals} is none\n"
+                         f"use 1 to {GOALS}")  # fmt: skip
+    if not 1 <= args.horizon <= MAX_HORIZON:
+        raise ValueError(
+            f"Meta-World's episodes end at {MAX_HORIZON} steps, --horizon {args.horizon} is none\n"
+            f"use 1 to {MAX_HORIZON}"
+        )
+    if args.noise is not None and not 0 <= args.noise < float("inf"):
+        raise ValueError(f"--noise {args.noise} is no standard deviation\nuse 0 or more, as 0.3")
+    if args.seed is not None and not 0 <= args.seed <= _LARGEST_SEED:
+        raise ValueError(f"--seed {args.seed} is out of range\nuse 0 to {_LARGEST_SEED}")
+    if args.json and not args.json.parent.is_dir():
+        raise ValueError(f"{args.json.parent} is not a directory\ncreate it or change --json")
+
+
+def measure(
+    goal_set: str,
+    goals: int,
+    horizon: int,
+    noises: Sequence[float],
+    seed: int,
+    all_parts: bool,
+) -> dict[str, Any]:
+    """Measures the port.
+
+    Args:
+        goal_set: see `goal_sets.load_goal_set`.
+        goals: goals a task, the first of the set.
+        horizon: control steps an episode.
+        noises: standard deviations of the action noise, one closed-loop run each; the figures of
+            the first stand directly under the task's name.
+        seed: of noise and of perturbed and random rollouts.
+        all_parts: False measures the closed loop only.
+
+    Returns:
+        A dict in the shape of the JSON file.
+
+    Raises:
+        ValueError: unknown goal set.
+    """
+    places = load_goal_set(goal_set)[:, :goals]
+    # Parity is a matter of float32; TF32 on an accelerator would be another number format.
+    import jax
+
+    jax.config.update("jax_default_matmul_precision", "highest")
+    from envs import parity_parts as parts
+    from envs.tasks import TASKS
+
+    port = parts.Port(lanes=places.shape[0] * goals)
+    tasks: dict[str, dict[str, Any]] = {task: {} for task in TASKS}
+
+    def add(results: list[dict[str, Any]]) -> None:
+        for task, result in zip(TASKS, results, strict=True):
+            tasks[task] |= result
+
+    runs = {}
+    for noise in noises:
+        stream = parts.draw_noise(places, horizon, noise, seed)
+        runs[f"{noise:g}"] = parts.measure_closed_loop(port, places, stream)
+    add(next(iter(runs.values())))
+    add([{"closed_loop": {n: run[i] for n, run in runs.items()}} for i in range(len(TASKS))])
+    if all_parts:
+        rollouts = parts.record(places[:, :STATE_GOALS], horizon, seed)
+        add(parts.measure_injected(port, rollouts))
+        add(parts.measure_open_loop(port, rollouts))
+        add(parts.measure_resets(port, places))
+    names = ("jax", "mujoco", "mujoco-mjx", "metaworld")
+    return {
+        "tasks": tasks,
+        "physics": "mjx",
+        "goals": goals,
+        "goal_set": goal_set,
+        "seed": seed,
+        "noise": noises[0],
+        "horizon": horizon,
+        "versions": {name: importlib.metadata.version(name) for name in names},
+    }
+
+
+def _run(words: Sequence[str]) -> None:
+    args = _parser().parse_args(words)
+    _check(args)
+    goal_set = args.goal_set or ("heldout" if args.seed is None else f"fresh:{args.seed}")
+    noises = [args.noise or 0.0]
+    if not args.policies:
+        noises.append(DEFAULT_NOISE if noises[0] == 0 else 0.0)
+    start = time.perf_counter()
+    result = measure(goal_set, args.goals, args.horizon, noises, args.seed or 0, not args.policies)
+    result["seconds"] = round(time.perf_counter() - start, 1)
+    from envs.parity_report import report, to_json
+
+    print(report(result))
+    print(f"\nmeasured in {result['seconds']:.0f} s, compiling included")
+    if args.json:
+        args.json.write_text(to_json(result))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the measurement; a mistake of the user is two lines (cause, cure) and exit code 2."""
+    try:
+        _run(sys.argv[1:] if argv is None else argv)
+    except ValueError as error:
+        cause, _, cure = str(error).partition("\n")
+        if not cure:  # not one of ours
+            raise
+        print(f"error: {cause}\nfix: {cure}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

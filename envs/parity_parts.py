@@ -1,0 +1,331 @@
+"""The five measurements of `python -m envs.parity`: our environment against Meta-World's own.
+
+Every function returns one dict per task, in the order of `tasks.TASKS`. Both sides get the same
+states, actions, noise and goals; lanes are ordered task first, goal second. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.mjx_physics import PhysicsState, Positions
+from envs.model import FIXTURE_BODY, LEFT_FINGER, RIGHT_FINGER, SLIDE
+from envs.reference import ReferenceEnv, Rollout, record_rollout, scripted_policy
+from envs.sawyer import Ml4Env, State
+from envs.tasks import SCENE_ID, SPECS, TASKS
+
+OPEN_LOOP_STEPS = (1, 10, 50, 100, 150)
+ROLLOUTS = ("scripted", "perturbed", "random")
+ROW_STRIDE = 5  # every fifth state of a rollout is injected
+THRESHOLD_BAND = 1e-4
+# Distance at which each task succeeds; Meta-World's info calls that distance obj_to_target.
+SUCCESS_DISTANCE = {
+    "drawer-open": 0.03,
+    "drawer-close": 0.065,
+    "window-open": 0.05,
+    "window-close": 0.05,
+}
+
+
+class Port:
+    """Our environment as compiled functions of a fixed number of lanes.
+
+    Args:
+        lanes: batch size of the one compiled step; longer batches go through it in pieces.
+    """
+
+    def __init__(self, lanes: int):
+        env = Ml4Env()
+        scene_id = jnp.asarray(SCENE_ID)
+        self.lanes = lanes
+        self.reset = jax.jit(jax.vmap(env.reset_to))
+        self.step = jax.jit(jax.vmap(env.step))
+
+        def observe(state: State, action: jax.Array) -> State:
+            positions = env.physics.positions(state.physics, scene_id[state.task_id])
+            return env.observe(state, state.physics, positions, action)
+
+        self.observe = jax.jit(jax.vmap(observe))
+        self.observe_positions = jax.jit(
+            jax.vmap(lambda state, positions, a: env.observe(state, state.physics, positions, a))
+        )
+
+    def in_pieces(self, function: Callable[..., State], *trees: Any) -> State:
+        """`function` over trees with any number of rows; the result is on the host."""
+        rows = jax.tree.leaves(trees)[0].shape[0]
+        index = np.arange(-(-rows // self.lanes) * self.lanes) % rows
+        pieces = []
+        for piece in index.reshape(-1, self.lanes):
+            result = function(*jax.tree.map(lambda leaf: leaf[piece], trees))
+            pieces.append(jax.tree.map(np.asarray, result))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:rows], *pieces)
+
+
+def port_states(rollout: Rollout, rows: np.ndarray, frames: np.ndarray) -> State:
+    """Recorded states of Meta-World in our form, numpy leaves with a leading row axis.
+
+    Args:
+        rows: which states of the rollout.
+        frames: (row, 18) what the next observation shows as the previous frame.
+    """
+    count = len(rows)
+    float32 = lambda array: np.asarray(array, np.float32)
+    physics = PhysicsState(
+        qpos=float32(rollout.qpos[rows]),
+        qvel=float32(rollout.qvel[rows]),
+        warm_start=float32(rollout.warmstart[rows]),
+        mocap=float32(rollout.mocap_pos[rows]),
+        placement=float32(np.tile(rollout.rand_vec, (count, 1))),
+    )
+    return State(
+        physics=physics,
+        task_id=np.full(count, TASKS.index(rollout.task), np.int32),
+        frame=float32(frames),
+        obs=np.zeros((count, 39), np.float32),
+        reward=np.zeros(count, np.float32),
+        success=np.zeros(count, bool),
+        distance=np.zeros(count, np.float32),
+        steps=np.zeros(count, np.int32),
+    )
+
+
+def record(goals: np.ndarray, steps: int, seed: int) -> list[Rollout]:
+    """Scripted, perturbed and random episodes of Meta-World on goals (task, goal, 3)."""
+    return [
+        record_rollout(task, goal, kind, steps, seed=seed + number)
+        for task, places in zip(TASKS, goals, strict=True)
+        for number, goal in enumerate(places)
+        for kind in ROLLOUTS
+    ]
+
+
+def part_errors(ours: State, qpos: np.ndarray, hand: np.ndarray) -> dict[str, np.ndarray]:
+    """Errors (row,) in metres of our states against joint and hand positions of Meta-World."""
+    fingers = slice(RIGHT_FINGER, LEFT_FINGER + 1)
+    error = np.abs(np.asarray(ours.physics.qpos, np.float64) - qpos)
+    return {
+        "hand": np.linalg.norm(np.asarray(ours.frame, np.float64)[:, :3] - hand, axis=-1),
+        "fingers": error[:, fingers].max(-1),
+        "fixture": error[:, SLIDE],
+    }
+
+
+def quantiles(errors: np.ndarray) -> dict[str, float]:
+    """p50, p99 and maximum; NaN where there is nothing to measure."""
+    if not errors.size:
+        return dict.fromkeys(("p50", "p99", "max"), float("nan"))
+    return {
+        "p50": float(np.quantile(errors, 0.5)),
+        "p99": float(np.quantile(errors, 0.99)),
+        "max": float(errors.max()),
+    }
+
+
+def measure_injected(port: Port, rollouts: list[Rollout]) -> list[dict[str, Any]]:
+    """Parts 1 and 2: observation, reward and success in given states, and one step from them."""
+    return [_injected_task(port, task, [r for r in rollouts if r.task == task]) for task in TASKS]
+
+
+def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, Any]:
+    reference = ReferenceEnv(task)
+    states, actions, positions, before, onward, contact = [], [], [], [], [], []
+    reward, success, distance, obs, qpos, hand = [], [], [], [], [], []
+    for rollout in rollouts:
+        rows = np.arange(1, len(rollout.action), ROW_STRIDE)
+        states.append(port_states(rollout, rows, rollout.prev_frame[rows]))
+        before.append(port_states(rollout, rows, rollout.prev_frame[rows + 1]))
+        actions.append(rollout.action[rows - 1])
+        onward.append(rollout.action[rows])
+        qpos.append(rollout.qpos[rows + 1])
+        for row in rows:
+            verdict = reference.inject(rollout.state(row), rollout.action[row - 1])
+            obs.append(verdict[0])
+            reward.append(verdict[1])
+            success.append(verdict[2])
+            distance.append(verdict[3]["obj_to_target"])
+            positions.append(_positions(reference))
+            touching = _touching(reference)
+            reference.inject(rollout.state(row + 1), rollout.action[row])
+            contact.append(touching or _touching(reference))
+            hand.append(reference.positions().hand)
+    stack = lambda trees: jax.tree.map(lambda *x: np.concatenate(x), *trees)
+    exact = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *positions)
+    states, action = stack(states), np.concatenate(actions)
+    ours = port.in_pieces(port.observe, states, action)
+    logic = port.in_pieces(port.observe_positions, states, exact, action)
+    near = np.abs(np.array(distance) - SUCCESS_DISTANCE[task]) <= THRESHOLD_BAND
+    wrong = ours.success != np.array(success)
+    stepped = port.in_pieces(port.step, stack(before), np.concatenate(onward))
+    errors = part_errors(stepped, np.concatenate(qpos), np.array(hand))
+    touching = np.array(contact)
+    worst = np.max(list(errors.values()), 0)
+    split = {"contact": touching, "no_contact": ~touching}
+    return {
+        "injected": {
+            "obs_max": float(np.abs(ours.obs - np.array(obs)).max()),
+            "reward_max": float(np.abs(ours.reward - np.array(reward)).max()),
+            "success_mismatches": int((wrong & ~near).sum()),
+            "near_threshold": int(near.sum()),
+            "near_threshold_mismatches": int((wrong & near).sum()),
+            "states": len(reward),
+            # The same with Meta-World's own positions in place of our float32 kinematics.
+            "from_positions": {
+                "obs_max": float(np.abs(logic.obs - np.array(obs)).max()),
+                "reward_max": float(np.abs(logic.reward - np.array(reward)).max()),
+            },
+        },
+        "one_step": quantiles(worst)
+        | {
+            name: {"states": int(chosen.sum())}
+            | {part: quantiles(error[chosen]) for part, error in errors.items()}
+            for name, chosen in split.items()
+        },
+    }
+
+
+def _positions(reference: ReferenceEnv) -> Positions:
+    exact = reference.positions()
+    data: Any = reference.env.data
+    body = FIXTURE_BODY[SPECS[TASKS.index(reference.task)].scene]
+    return Positions(
+        hand=exact.hand,
+        right_tip=exact.tcp,
+        left_tip=exact.tcp,
+        finger_gap=np.linalg.norm(exact.right_finger - exact.left_finger),
+        fixture=data.body(body).xpos.copy(),
+        slide=data.qpos[SLIDE].copy(),
+    )
+
+
+def _touching(reference: ReferenceEnv) -> bool:
+    """Whether any contact pushes: in free space the gripper touches nothing, not even itself."""
+    data: Any = reference.env.data
+    return bool((data.contact.efc_address >= 0).any())
+
+
+def measure_open_loop(port: Port, rollouts: list[Rollout]) -> list[dict[str, Any]]:
+    """Part 3: their recorded actions replayed from their start state; errors grow over time."""
+    chosen = [r for r in rollouts if r.task in TASKS]
+    steps = min(OPEN_LOOP_STEPS[-1], min(len(r.action) for r in chosen))
+    start = np.zeros(1, np.int64)
+    states = [port_states(r, start, r.prev_frame[start + 1]) for r in chosen]
+    state = jax.tree.map(lambda *x: np.concatenate(x), *states)
+    marks = [step for step in OPEN_LOOP_STEPS if step <= steps]
+    errors: dict[int, dict[str, np.ndarray]] = {}
+    for step in range(1, steps + 1):
+        state = port.in_pieces(port.step, state, np.stack([r.action[step - 1] for r in chosen]))
+        if step in marks:
+            # The hand of row t + 1's previous frame is the hand of row t, unclipped.
+            hand = np.stack([_hand(r, step) for r in chosen])
+            errors[step] = part_errors(state, np.stack([r.qpos[step] for r in chosen]), hand)
+    results = []
+    for task in TASKS:
+        lanes = np.array([r.task == task for r in chosen])
+        by_step = {step: {n: e[lanes] for n, e in errors[step].items()} for step in marks}
+        worst = {step: np.max(list(parts.values()), 0) for step, parts in by_step.items()}
+        results.append(
+            {
+                "open_loop": {str(step): float(worst[step].max()) for step in marks},
+                "open_loop_median": {str(step): float(np.median(worst[step])) for step in marks},
+                "open_loop_parts": {
+                    str(step): {n: float(e.max()) for n, e in parts.items()}
+                    for step, parts in by_step.items()
+                },
+            }
+        )
+    return results
+
+
+def _hand(rollout: Rollout, row: int) -> np.ndarray:
+    if row + 1 < len(rollout.prev_frame):
+        return rollout.prev_frame[row + 1, :3]
+    return rollout.obs[row, :3]
+
+
+def measure_resets(port: Port, goals: np.ndarray) -> list[dict[str, Any]]:
+    """Part 5: start observations over goals (task, goal, 3)."""
+    count = goals.shape[1]
+    task_ids = np.repeat(np.arange(len(TASKS), dtype=np.int32), count)
+    ours = np.asarray(port.reset(task_ids, goals.reshape(-1, 3).astype(np.float32)).obs)
+    results = []
+    for task, places, obs in zip(TASKS, goals, np.split(ours, len(TASKS)), strict=True):
+        reference = ReferenceEnv(task)
+        theirs = np.stack([reference.reset(place) for place in places])
+        results.append({"reset_obs_max": float(np.abs(obs - theirs).max())})
+    return results
+
+
+def draw_noise(goals: np.ndarray, horizon: int, scale: float, seed: int) -> np.ndarray:
+    """Gaussian action noise (task, goal, step, 4) that both sides add."""
+    shape = (*goals.shape[:2], horizon, 4)
+    return scale * np.random.default_rng(seed).standard_normal(shape)
+
+
+def _action(policy: Any, obs: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    action = np.clip(policy.get_action(obs), -1, 1) + noise
+    return np.clip(action, -1, 1).astype(np.float32)
+
+
+def port_episodes(port: Port, goals: np.ndarray, noise: np.ndarray) -> tuple[Any, Any]:
+    """Scripted policies in our environment: reward and success, (task, goal, step) each."""
+    tasks, count = goals.shape[:2]
+    task_ids = np.repeat(np.arange(tasks, dtype=np.int32), count)
+    policies = [scripted_policy(TASKS[i]) for i in task_ids]
+    noise = noise.reshape(tasks * count, -1, 4)
+    state = port.reset(task_ids, goals.reshape(-1, 3).astype(np.float32))
+    rewards, successes = [], []
+    for step in range(noise.shape[1]):
+        obs = np.asarray(state.obs, np.float64)
+        actions = [_action(p, o, n) for p, o, n in zip(policies, obs, noise[:, step], strict=True)]
+        state = port.step(state, np.stack(actions))
+        rewards.append(np.asarray(state.reward))
+        successes.append(np.asarray(state.success))
+    shape = (tasks, count, -1)
+    return np.stack(rewards, 1).reshape(shape), np.stack(successes, 1).reshape(shape)
+
+
+def reference_episodes(goals: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same in Meta-World: reward and success, (task, goal, step) each."""
+    rewards, successes = np.zeros(noise.shape[:3]), np.zeros(noise.shape[:3], bool)
+    for i, task in enumerate(TASKS):
+        env, policy = ReferenceEnv(task), scripted_policy(task)
+        for j, place in enumerate(goals[i]):
+            obs = env.reset(place)
+            for step, disturbance in enumerate(noise[i, j]):
+                obs, reward, success, _ = env.step(_action(policy, obs, disturbance))
+                rewards[i, j, step], successes[i, j, step] = reward, success
+    return rewards, successes
+
+
+def measure_closed_loop(port: Port, goals: np.ndarray, noise: np.ndarray) -> list[dict[str, Any]]:
+    """Part 4: scripted policies on both sides, under the same noise (task, goal, step, 4)."""
+    ours, theirs = port_episodes(port, goals, noise), reference_episodes(goals, noise)
+    return [_compare(*(x[i] for x in (*ours, *theirs))) for i in range(len(TASKS))]
+
+
+def _compare(
+    reward: np.ndarray, success: np.ndarray, their_reward: np.ndarray, their_success: np.ndarray
+) -> dict[str, Any]:
+    """Figures of one task from reward and success (goal, step) of both sides."""
+    ours, theirs = _summary(reward, success), _summary(their_reward, their_success)
+    return ours | {
+        "return_ratio": ours["return"] / theirs["return"],
+        "nonfinite_lanes": int((~np.isfinite(reward)).any(-1).sum()),
+        **{f"reference_{name}": value for name, value in theirs.items()},
+    }
+
+
+def _summary(reward: np.ndarray, success: np.ndarray) -> dict[str, float]:
+    solved = success.any(-1)
+    first = 1 + success.argmax(-1)[solved]  # in control steps after the reset
+    return {
+        "success_any": float(solved.mean()),
+        "success_last": float(success[:, -1].mean()),
+        "return": float(reward.sum(-1).mean()),
+        "first_success_step": float(first.mean()) if solved.any() else float("nan"),
+    }
