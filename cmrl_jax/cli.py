@@ -23,8 +23,10 @@ from cmrl_jax.config_io import (
     find_config,
     read_yaml,
     resolve,
+    to_yaml,
 )
 from cmrl_jax.run_dir import config_stem, find_run, new_run, resumed_run
+from cmrl_jax.stop import StopSignal
 from cmrl_jax.validate import check_goal_set
 
 COMMANDS = ("train", "eval", "bench")
@@ -137,10 +139,15 @@ def _train(words: list[str]) -> int:
             check_resumable(read_yaml(run / "config.yaml")[0], config, run)
     else:
         run = new_run(config_stem(path), run)
+        (run / "config.yaml").write_text(to_yaml(config), encoding="utf-8")  # now it can be resumed
+    stop = StopSignal()  # before the imports that take seconds
 
-    from cmrl_jax import trainer
+    try:
+        from cmrl_jax import trainer
 
-    return trainer.train(config=config, run_dir=run, resume=resume)
+        return trainer.train(config=config, run_dir=run, stop=stop, resume=resume)
+    finally:
+        stop.restore()
 
 
 def _check_extras(config: Config) -> None:

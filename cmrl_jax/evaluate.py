@@ -151,6 +151,10 @@ class Evaluator:
         inference = self._learner.inference
         return init_belief((self.lanes,), inference.latent_dim) if inference else None
 
+    @property
+    def is_compiled(self) -> bool:
+        return self._compiled is not None
+
     def compile(self, params: PolicyParams) -> None:
         """Compiles the episode for these parameter shapes; later calls do not compile."""
         if self._compiled is None:
@@ -216,3 +220,13 @@ def summarise(scores: dict[int, Episode], tasks: Sequence[str]) -> dict[str, Any
         }
         for row, task in enumerate(tasks)
     }
+
+
+def format_scores(summary: dict[str, Any]) -> str:
+    """A table of an evaluation: success at any and last step and return, per task and k."""
+    lines = [f"{'task':<14} {'k':>3} {'any step':>9} {'last step':>9} {'return':>8}"]
+    for task, by_k in summary.items():
+        for k, f in by_k.items():
+            figures = f"{f['success_any']:>9.2f} {f['success_last']:>9.2f} {f['return']:>8.0f}"
+            lines.append(f"{task:<14} {k:>3} {figures}")
+    return "\n".join(lines)

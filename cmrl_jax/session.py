@@ -61,14 +61,21 @@ class Session:
         train = call_envs(lambda: load_goal_set("train", self.config.tasks.train))
         return jnp.asarray(train, jnp.float32)
 
-    def evaluator(self, horizon: int | None = None) -> Evaluator:
-        """The evaluator of the run; a batch of it is one periodic evaluation."""
+    def evaluator(
+        self, horizon: int | None = None, goal_vectors: np.ndarray | None = None
+    ) -> Evaluator:
+        """The evaluator of the run; a batch of it is one periodic evaluation.
+
+        Args:
+            horizon: control steps an episode; None for the run's own.
+            goal_vectors: (task, G); None for the first paraphrase of the table.
+        """
         return Evaluator(
             self.config,
             self.env,
             self.learner,
             self.eval_tasks,
-            self.goals.vectors[:, 0],
+            self.goals.vectors[:, 0] if goal_vectors is None else goal_vectors,
             lanes=self.config.eval.goals * len(self.eval_tasks),
             horizon=horizon,
         )

@@ -9,9 +9,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
-import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from cmrl_jax.collect import (
 )
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import to_yaml
-from cmrl_jax.evaluate import summarise
+from cmrl_jax.evaluate import format_scores, summarise
 from cmrl_jax.metrics import (
     LEADING_COLUMNS,
     Console,
@@ -41,27 +40,9 @@ from cmrl_jax.metrics import (
     write_versions,
 )
 from cmrl_jax.session import Session, policy_params, prepare_jax
+from cmrl_jax.stop import StopSignal
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
-
-
-class StopSignal:
-    """SIGINT or SIGTERM: the first asks the loop to stop at the next border, the second stops."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._old = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
-
-    def _handle(self, number: int, frame: Any) -> None:
-        if self.requested:
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-        self.requested = True
-        print("stopping at the end of this iteration; once more to stop at once", flush=True)
-
-    def restore(self) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,18 +74,17 @@ class Schedule:
         return iterations_done % self.eval_interval == 0
 
 
-def train(config: Config, run_dir: Path, resume: bool = False) -> int:
+def train(config: Config, run_dir: Path, stop: StopSignal, resume: bool = False) -> int:
     """Trains to the end of the schedule or to a signal; returns the exit code.
+
+    Args:
+        stop: the signal handlers, already installed.
 
     Raises:
         ConfigError: anything the user can mend, before the first compile where possible.
     """
-    stop = StopSignal()
-    try:
-        with full_store(run_dir, config.checkpoint.keep) as full, policy_store(run_dir) as policy:
-            return _Run(config, run_dir, full, policy, stop).go(resume)
-    finally:
-        stop.restore()
+    with full_store(run_dir, config.checkpoint.keep) as full, policy_store(run_dir) as policy:
+        return _Run(config, run_dir, full, policy, stop).go(resume)
 
 
 class _Run:
@@ -134,7 +114,10 @@ class _Run:
         self.start(abstract, self.columns(metrics), resume)
         try:
             if self.iterations_left() and not self.stop.requested:
-                self.compile(iteration)
+                jitted = jax.jit(iteration, donate_argnums=0)
+                self.iteration = self.timed(
+                    "the training iteration", lambda: jitted.lower(self.state).compile()
+                )
             while self.iterations_left() and not self.stop.requested:
                 self.step()
             self.save()
@@ -199,12 +182,13 @@ class _Run:
                 "put that table back, or start a new run",
             )
 
-    def compile(self, iteration: Any) -> None:
+    def timed(self, what: str, compile: Callable[[], Any]) -> Any:
+        """Announces a compile and says how long it took."""
         started = time.monotonic()
-        self.say("compiling the training iteration ...")
-        jitted = jax.jit(iteration, donate_argnums=0)
-        self.iteration = jitted.lower(self.state).compile()
-        self.say(f"compiling the training iteration took {time.monotonic() - started:.1f} s")
+        self.say(f"compiling {what} ...")
+        result = compile()
+        self.say(f"compiling {what} took {time.monotonic() - started:.1f} s")
+        return result
 
     def iterations_left(self) -> bool:
         minutes, total = self.config.train.minutes, self.schedule.iterations
@@ -267,6 +251,8 @@ class _Run:
 
     def scores(self, goals: int, k: tuple[int, ...]) -> dict[str, Any]:
         params = policy_params(self.state.learner)
+        if not self.evaluator.is_compiled:
+            self.timed("the evaluation episode", lambda: self.evaluator.compile(params))
         placements = self.session.placements(self.config.eval.goal_set, goals)
         scores = self.evaluator.run(params, placements, k, self.config.eval.seed)
         return summarise(scores, self.session.eval_tasks)
@@ -329,13 +315,3 @@ class _Run:
 
     def resume_command(self) -> str:
         return f"python train.py --run {self.run_dir} --resume"
-
-
-def format_scores(summary: dict[str, Any]) -> str:
-    """A table of an evaluation: success at any and last step and return, per task and k."""
-    lines = [f"{'task':<14} {'k':>3} {'any step':>9} {'last step':>9} {'return':>8}"]
-    for task, by_k in summary.items():
-        for k, f in by_k.items():
-            figures = f"{f['success_any']:>9.2f} {f['success_last']:>9.2f} {f['return']:>8.0f}"
-            lines.append(f"{task:<14} {k:>3} {figures}")
-    return "\n".join(lines)

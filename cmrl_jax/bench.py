@@ -1,0 +1,183 @@
+"""`train.py bench`: what this machine does a second, as JSON rows that are flushed one by one.
+
+Kinds of rows (`--rows`): mjx (control steps), learner (gradient steps), start (seconds from the
+command to the end of the first iteration, with an empty and a filled compilation cache, and peak
+memory). Every figure is of `configs/ml4.yaml`, the main job.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from cmrl_jax.collect import init_run
+from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config_io import load_config
+from cmrl_jax.metrics import package_versions
+from cmrl_jax.replay import Transition, add
+from cmrl_jax.session import Session, prepare_jax
+from envs.sawyer import ACTION_SIZE, OBS_SIZE
+from envs.tasks import TASKS
+
+CONFIG = "ml4.yaml"
+LANES = (32, 256, 512)
+CONTROL_STEPS, GRADIENT_STEPS, REPEATS = 20, 100, 3
+
+
+class Report:
+    """The JSON file, rewritten after every row, so that a stopped run keeps its rows."""
+
+    def __init__(self, path: Path, device: str):
+        self._path = path
+        self._document: dict[str, Any] = {
+            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "device": device,
+            "cpu_count": os.cpu_count(),
+            "versions": package_versions(),
+            "rows": [],
+        }
+
+    def add(self, name: str, value: float, unit: str, **labels: Any) -> None:
+        self._document["rows"].append({"name": name, "value": value, "unit": unit} | labels)
+        self._path.write_text(json.dumps(self._document, indent=2) + "\n", encoding="utf-8")
+        shown = " ".join(f"{key}={label}" for key, label in labels.items())
+        print(f"{name:<30} {value:>10.1f} {unit:<8} {shown}", flush=True)
+
+
+def best_seconds(run: Callable[[], Any]) -> float:
+    """The shortest of a few runs: other work on the machine only ever adds time."""
+    seconds = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - started)
+    return min(seconds)
+
+
+def bench_mjx(session: Session, report: Report) -> None:
+    """Control steps a second of all four tasks with random actions, by number of lanes."""
+    env = session.env
+
+    def steps(state, key):
+        def step(state, key):
+            action = jax.random.uniform(key, (len(state.steps), ACTION_SIZE), minval=-1, maxval=1)
+            return jax.vmap(env.step)(state, action), None
+
+        return jax.lax.scan(step, state, jax.random.split(key, CONTROL_STEPS))[0]
+
+    for lanes in LANES:
+        task = jnp.arange(lanes) % len(TASKS)
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), lanes), task)
+        started = time.perf_counter()
+        compiled = jax.jit(steps).lower(state, jax.random.key(1)).compile()
+        compile_s = time.perf_counter() - started
+        seconds = best_seconds(lambda: compiled(state, jax.random.key(1)))
+        rate = lanes * CONTROL_STEPS / seconds
+        report.add("mjx/control_steps_per_s", rate, "1/s", lanes=lanes)
+        report.add("mjx/compile_s", compile_s, "s", lanes=lanes)
+
+
+def bench_learner(session: Session, report: Report) -> None:
+    """Gradient steps a second on rings full of random transitions."""
+    config, learner = session.config, session.learner
+    run = jax.jit(lambda key: init_run(config, learner, key))(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), 4)
+    lead = (config.env.horizon, len(config.tasks.train), run.replay.lanes_per_task)
+    flag = jnp.zeros(lead, bool)
+    data = Transition(
+        obs=jax.random.normal(keys[0], (*lead, OBS_SIZE)),
+        action=jax.random.uniform(keys[1], (*lead, ACTION_SIZE), minval=-1, maxval=1),
+        reward=jax.random.uniform(keys[2], lead),
+        terminated=flag,
+        truncated=flag,
+        first=flag,
+        next_obs=jax.random.normal(keys[3], (*lead, OBS_SIZE)),
+    )
+    replay = jax.jit(add)(run.replay, data)
+    writers = run.context.lanes_per_task
+    context = jax.jit(add)(run.context, jax.tree.map(lambda x: x[:, :, :writers], data))
+
+    def updates(state, key):
+        def step(state, key):
+            return learner.update(state, replay, context, key)[0], None
+
+        return jax.lax.scan(step, state, jax.random.split(key, GRADIENT_STEPS))[0]
+
+    compiled = jax.jit(updates).lower(run.learner, jax.random.key(2)).compile()
+    seconds = best_seconds(lambda: compiled(run.learner, jax.random.key(2)))
+    shape = f"{len(config.tasks.train)}x{config.sac.batch}"
+    report.add("learner/gradient_steps_per_s", GRADIENT_STEPS / seconds, "1/s", batch=shape)
+
+
+def bench_start(report: Report) -> None:
+    """Two processes of the main job: the first compiles, the second finds everything compiled."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("cold", "warm"):
+            seconds, peak = time_to_iterations(Path(folder), name)
+            report.add(f"start/{name}_s", seconds, "s")
+        report.add("memory/peak_mb", peak, "MB")
+
+
+def time_to_iterations(folder: Path, name: str) -> tuple[float, float]:
+    """Seconds to the end of iteration 0, and peak memory in MB by the end of iteration 1."""
+    script = Path(__file__).resolve().parent.parent / "train.py"
+    launch = [str(script)] if script.is_file() else ["-m", "cmrl_jax"]
+    command = [sys.executable, *launch, "--config", CONFIG, "--run", str(folder / name)]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache")}
+    started = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    assert process.stdout is not None
+    seconds = None
+    try:
+        for line in process.stdout:
+            if line.startswith("iter ") and seconds is None:
+                seconds = time.perf_counter() - started
+            elif line.startswith("iter "):
+                return seconds or 0.0, peak_memory_mb(process.pid)
+    finally:
+        process.kill()
+        process.wait()
+    raise RuntimeError(f"{' '.join(command)} ended before its second iteration")
+
+
+def peak_memory_mb(pid: int) -> float:
+    """Peak resident memory of a running process, from the kernel (Linux)."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024
+    raise RuntimeError("the kernel reports no peak memory")
+
+
+def main(json_path: Path, rows: tuple[str, ...]) -> int:
+    """Measures the chosen kinds of rows (all by default); returns the exit code.
+
+    Raises:
+        ConfigError: an unknown kind.
+    """
+    kinds = ("mjx", "learner", "start")
+    for row in rows:
+        if row not in kinds:
+            raise ConfigError(f"unknown rows '{row}'", f"choose from: {', '.join(kinds)}")
+    chosen = rows or kinds
+    config: Config = load_config(CONFIG)
+    report = Report(json_path, prepare_jax(config))
+    if {"mjx", "learner"} & set(chosen):
+        session = Session(config)
+        if "mjx" in chosen:
+            bench_mjx(session, report)
+        if "learner" in chosen:
+            bench_learner(session, report)
+    if "start" in chosen:
+        bench_start(report)
+    return 0
