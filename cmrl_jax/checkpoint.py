@@ -53,7 +53,7 @@ class CheckpointStore:
         """Open a store; the functions `full_store` and `policy_store` name the two of a run.
 
         Raises:
-            ConfigError: nothing to read there, or the directory cannot be written.
+            ConfigError: the directory cannot be made.
         """
         self.directory = directory.absolute()  # orbax refuses relative paths
         self.items = items
@@ -64,8 +64,6 @@ class CheckpointStore:
                 cause = f"cannot write checkpoints to {directory}: {error.strerror}"
                 cure = "give a run directory you may write to: --run DIR"
                 raise ConfigError(cause, cure) from error
-        elif not self.directory.is_dir():
-            raise _nothing_saved(self.directory)
         options = ocp.CheckpointManagerOptions(
             preservation_policy=ocp.checkpoint_managers.LatestN(n=keep) if keep else None,
             cleanup_tmp_directories=not read_only,
@@ -103,7 +101,9 @@ class CheckpointStore:
                 return False
             raise ValueError(f"iteration {step} comes after {saved[-1]} was saved")
         flat = {name: _flatten(tree) for name, tree in trees.items()}
-        args = {name: ocp.args.StandardSave(leaves) for name, leaves in flat.items() if leaves}
+        args: dict[str, Any] = {
+            name: ocp.args.StandardSave(leaves) for name, leaves in flat.items() if leaves
+        }
         # Copied as text here: orbax writes it later, when the caller may have changed it.
         args["meta"] = ocp.args.JsonSave(json.loads(json.dumps(meta)))
         with _quiet_orbax():

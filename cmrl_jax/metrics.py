@@ -126,7 +126,7 @@ def _check_resumable(path: Path, header: bytes, offset: int) -> None:
                 "resume with the version that wrote it (versions.json), or start a new run",
             )
         file.seek(max(offset - 1, 0))
-        if offset < len(header) or file.read(1) != b"\n":
+        if file.read(1) != b"\n":
             cause = f"{path} does not end a row at byte {offset}, where its checkpoint was taken"
             raise ConfigError(cause, cure)
 

@@ -7,6 +7,8 @@ because it adds centred batch sums and counts in 64 bits.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from brax.training.acme import running_statistics
@@ -25,7 +27,7 @@ def init_obs_stats(obs_size: int) -> ObsStats:
     """Statistics of no observation at all: normalising with them only clips."""
     stats = running_statistics.init_state(jnp.zeros((obs_size,), jnp.float32))
     # brax leaves a Python float here: it would be weakly typed and retrace every program.
-    return stats.replace(std_eps=jnp.zeros((), jnp.float32))
+    return replace(stats, std_eps=jnp.zeros((), jnp.float32))
 
 
 def update_obs_stats(stats: ObsStats, obs: jax.Array) -> ObsStats:
@@ -44,7 +46,7 @@ def normalize_obs(stats: ObsStats, obs: jax.Array) -> jax.Array:
         obs: (..., obs).
     """
     normalized = running_statistics.normalize(obs, stats, max_abs_value=OBS_CLIP)
-    return jnp.where(stats.std < CONSTANT_STD, 0.0, normalized)
+    return jnp.where(jnp.asarray(stats.std) < CONSTANT_STD, 0.0, normalized)
 
 
 @struct.dataclass

@@ -169,9 +169,23 @@ def test_a_save_cut_short_leaves_the_one_before_and_is_swept(tmp_path):
     assert meta["iteration"] == 1
     assert_equal_trees(trees["learner"], init_state(1))
     assert cut.exists(), "a reader must not touch a save that may be going on"
-    save_steps(tmp_path, 2)
+    save_steps(tmp_path, 3)  # another step, which does not need that name
     assert not cut.exists()
-    assert_equal_trees(restore(tmp_path)[0]["learner"], init_state(2))
+    assert_equal_trees(restore(tmp_path)[0]["learner"], init_state(3))
+
+
+def test_a_long_complaint_is_cut_to_one_line(tmp_path, monkeypatch):
+    save_steps(tmp_path, 1)
+
+    def complain(*_: object, **__: object):
+        raise RuntimeError("first line" + "." * 900 + "\nsecond line")
+
+    with checkpoint.full_store(tmp_path, read_only=True) as store:
+        monkeypatch.setattr(store._manager, "restore", complain)
+        with pytest.raises(ConfigError) as raised:
+            store.read_meta()
+    cause = raised.value.cause
+    assert "first line" in cause and "\n" not in cause and len(cause) < 600
 
 
 def test_nothing_to_restore(tmp_path):

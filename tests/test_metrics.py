@@ -82,6 +82,7 @@ def test_a_resumed_file_goes_on_without_a_gap_or_a_repeat(tmp_path):
     with open(path, "ab") as file:
         file.write(b"2,20,4,0")  # killed in the middle of a row
     csv = metrics.MetricsCsv(path, COLUMNS, offset)
+    assert path.stat().st_size == offset, "rows after the checkpoint were kept"
     csv.write(make_row(1))
     csv.write(make_row(2))
     csv.close()
@@ -121,8 +122,7 @@ def test_columns_and_rows_are_checked(tmp_path):
 
 
 def test_tensorboard_events_hold_the_figures(tmp_path):
-    pytest.importorskip("tensorboardX")
-    from tensorboardX.proto.event_pb2 import Event
+    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
 
     sink = metrics.TensorBoard(tmp_path)
     sink.write(make_row(3, **{"train/critic_loss": jnp.float32(0.25), "train/absent": None}))
@@ -131,7 +131,7 @@ def test_tensorboard_events_hold_the_figures(tmp_path):
     data, found = path.read_bytes(), []
     while data:  # records: length (8 bytes), checksum (4), event, checksum (4)
         length = int.from_bytes(data[:8], "little")
-        event = Event.FromString(data[12 : 12 + length])
+        event = event_pb2.Event.FromString(data[12 : 12 + length])
         found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
         data = data[16 + length :]
     assert found == [(30, "train/critic_loss", 0.25)]

@@ -21,8 +21,8 @@ def test_observation_statistics_pool_all_leading_axes():
     for chunk in data:
         stats = update(stats, jnp.asarray(chunk))
     flat = data.reshape(-1, 2).astype(np.float64)
-    np.testing.assert_allclose(stats.mean, flat.mean(0), rtol=1e-5)
-    np.testing.assert_allclose(stats.std, flat.std(0), rtol=1e-4)
+    np.testing.assert_allclose(np.asarray(stats.mean), flat.mean(0), rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(stats.std), flat.std(0), rtol=1e-4)
     probe = np.array([0.61, 1.0])
     np.testing.assert_allclose(
         normalizers.normalize_obs(stats, jnp.asarray(probe, jnp.float32)),

@@ -1,6 +1,7 @@
 """The rings against a deque of plain Python records, one per lane and task."""
 
 from collections import deque
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -102,7 +103,7 @@ def test_a_window_never_crosses_lanes_or_episodes(sign: str):
     none = jnp.zeros_like(ends)
     signs = {"terminated": none, "truncated": none, "first": none}
     signs[sign] = steps.first if sign == "first" else ends
-    steps = steps.replace(reward=steps.obs[..., 1], **signs)
+    steps = replace(steps, reward=steps.obs[..., 1], **signs)
     state = add(replay.init_replay(TASKS, CAPACITY, LANES, OBS, ACT), steps)
     batch = sample(state, jax.random.key(0), jnp.arange(TASKS), batch=256, n_step=3, gamma=1.0)
     time, lane = np.asarray(batch.obs[..., 0]), np.asarray(batch.obs[..., 1])
