@@ -100,7 +100,7 @@ def finger_capsule_contacts(
     slide = jnp.concatenate([jnp.zeros(1), finger_slide])[gripper.finger_part]
     axis = jnp.concatenate([jnp.zeros((1, 3)), gripper.finger_axis])[gripper.finger_part]
     center = link_pos + (gripper.finger_center + axis * slide[:, None]) @ link_rot.T  # (4, 3)
-    ends = shapes.capsule_ends + handle_shift  # (3, 2, 3)
+    ends = jnp.asarray(shapes.capsule_ends) + handle_shift  # (3, 2, 3)
     local = (ends[None] - center[:, None, None]) @ hand  # (box, capsule, end, 3)
     half = jnp.asarray(gripper.finger_half)[:, None]
     first, second, over_face = _segment_box(local[:, :, 0], local[:, :, 1], half)

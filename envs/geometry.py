@@ -109,7 +109,7 @@ def load_gripper(model: mujoco.MjModel) -> Gripper:
     half_width = _BASE_HALF_WIDTH
     base_ends = np.array(
         [
-            on_body("right_hand", [(x, -half_width + r, z), (x, half_width - r, z)])
+            on_body("right_hand", np.array([(x, -half_width + r, z), (x, half_width - r, z)]))
             for x, z, r in _BASE_CAPSULES
         ]
     )

@@ -7,19 +7,17 @@ stages (cameras, tendons, sensors, its collision driver) are skipped.
 
 from __future__ import annotations
 
+import contextlib
+import io
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from mujoco import mjx
-from mujoco.mjx._src import forward as mjx_forward
-from mujoco.mjx._src import math as mjx_math
-from mujoco.mjx._src import smooth as mjx_smooth
 
 from envs.contact import Contacts, find_contacts
-from envs.geometry import FixtureShapes, Gripper, load_gripper, load_shapes
+from envs.geometry import FixtureShapes, load_gripper, load_shapes
 from envs.model import (
     ARM_JOINTS,
     JOINTS,
@@ -35,14 +33,19 @@ from envs.model import (
 )
 from envs.solver import Rows, make_rows, solve
 
+with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp is not installed
+    from mujoco import mjx
+    from mujoco.mjx._src import forward as mjx_forward
+    from mujoco.mjx._src import math as mjx_math
+    from mujoco.mjx._src import smooth as mjx_smooth
+
 SUBSTEPS = 5
 SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6
 LIMIT_SOLREF, LIMIT_SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)  # MuJoCo defaults
 WELD_TORQUE_SCALE = 5.0  # SawyerMocapBase.reset_mocap_welds
 
 
-@struct.dataclass
-class PhysicsState:
+class PhysicsState(struct.PyTreeNode):
     """What a lane carries between control steps."""
 
     qpos: jax.Array  # (10,) 7 arm hinges, right finger, left finger, fixture slide
@@ -52,8 +55,7 @@ class PhysicsState:
     placement: jax.Array  # (3,) the fixture's position, metres
 
 
-@struct.dataclass
-class Positions:
+class Positions(struct.PyTreeNode):
     """What observation and reward read from a physics state, metres in the world."""
 
     hand: jax.Array  # (3,) body `hand`
@@ -125,9 +127,9 @@ class MjxPhysics:
         data = self._data.replace(qpos=state.qpos[:ROBOT_JOINTS])
         data = mjx_smooth.kinematics(self.model, data)
         pos, rot = data.xpos[ARM_JOINTS], data.xmat[ARM_JOINTS]
-        fingers = state.qpos[RIGHT_FINGER : LEFT_FINGER + 1]
+        fingers, axes = state.qpos[RIGHT_FINGER : LEFT_FINGER + 1], self._gripper.finger_axis
         moved = [
-            [pos + rot @ (p + a * q) for p, a, q in zip(points, self._gripper.finger_axis, fingers)]
+            [pos + rot @ (p + a * q) for p, a, q in zip(points, axes, fingers, strict=True)]
             for points in (self._claw, self._tip)
         ]
         return Positions(
@@ -245,7 +247,7 @@ class MjxPhysics:
         invweight = jnp.concatenate(
             [
                 jnp.asarray(self._dof_invweight, jnp.float32),
-                scene.fixture.dof_invweight[None],
+                jnp.asarray(scene.fixture.dof_invweight)[None],
                 stop_invweight,
             ]
         )

@@ -93,7 +93,7 @@ def _moving_ancestor(model: mujoco.MjModel, body: int) -> int:
 
 
 def _fused_inertia(data: mujoco.MjData, bodies: list[int], frame: int):
-    """Mass, centre of mass (3,) and inertia (3, 3) about it of rigidly joined bodies, in `frame`."""
+    """Mass, centre of mass (3,), inertia (3, 3) about it of rigidly joined bodies, in `frame`."""
     model = data.model
     mass = model.body_mass[bodies]
     com = np.average(data.xipos[bodies], axis=0, weights=mass)

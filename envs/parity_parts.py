@@ -16,7 +16,7 @@ import numpy as np
 from envs.mjx_physics import PhysicsState, Positions
 from envs.model import FIXTURE_BODY, LEFT_FINGER, RIGHT_FINGER, SLIDE
 from envs.reference import ReferenceEnv, Rollout, record_rollout, scripted_policy
-from envs.sawyer import Ml4Env, State
+from envs.sawyer import OBS_SIZE, Ml4Env, State
 from envs.tasks import SCENE_ID, SPECS, TASKS
 
 OPEN_LOOP_STEPS = (1, 10, 50, 100, 150)
@@ -74,7 +74,13 @@ def port_states(rollout: Rollout, rows: np.ndarray, frames: np.ndarray) -> State
         frames: (row, 18) what the next observation shows as the previous frame.
     """
     count = len(rows)
-    float32 = lambda array: np.asarray(array, np.float32)
+
+    def float32(array: np.ndarray) -> Any:
+        return np.asarray(array, np.float32)
+
+    def zeros(dtype: Any, *tail: int) -> Any:
+        return np.zeros((count, *tail), dtype)
+
     physics = PhysicsState(
         qpos=float32(rollout.qpos[rows]),
         qvel=float32(rollout.qvel[rows]),
@@ -84,13 +90,14 @@ def port_states(rollout: Rollout, rows: np.ndarray, frames: np.ndarray) -> State
     )
     return State(
         physics=physics,
-        task_id=np.full(count, TASKS.index(rollout.task), np.int32),
+        task_id=zeros(np.int32) + np.int32(TASKS.index(rollout.task)),
         frame=float32(frames),
-        obs=np.zeros((count, 39), np.float32),
-        reward=np.zeros(count, np.float32),
-        success=np.zeros(count, bool),
-        distance=np.zeros(count, np.float32),
-        steps=np.zeros(count, np.int32),
+        obs=zeros(np.float32, OBS_SIZE),
+        reward=zeros(np.float32),
+        success=zeros(bool),
+        distance=zeros(np.float32),
+        steps=zeros(np.int32),
+        faults=zeros(np.int32),
     )
 
 
@@ -142,7 +149,7 @@ def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, 
         actions.append(rollout.action[rows - 1])
         onward.append(rollout.action[rows])
         qpos.append(rollout.qpos[rows + 1])
-        for row in rows:
+        for row in rows.tolist():
             verdict = reference.inject(rollout.state(row), rollout.action[row - 1])
             obs.append(verdict[0])
             reward.append(verdict[1])
@@ -189,14 +196,15 @@ def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, 
 
 
 def _positions(reference: ReferenceEnv) -> Positions:
-    exact = reference.positions()
+    exact: Any = reference.positions()
+    gap: Any = np.linalg.norm(exact.right_finger - exact.left_finger)
     data: Any = reference.env.data
     body = FIXTURE_BODY[SPECS[TASKS.index(reference.task)].scene]
     return Positions(
         hand=exact.hand,
         right_tip=exact.tcp,
         left_tip=exact.tcp,
-        finger_gap=np.linalg.norm(exact.right_finger - exact.left_finger),
+        finger_gap=gap,
         fixture=data.body(body).xpos.copy(),
         slide=data.qpos[SLIDE].copy(),
     )
@@ -271,8 +279,11 @@ def _action(policy: Any, obs: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return np.clip(action, -1, 1).astype(np.float32)
 
 
-def port_episodes(port: Port, goals: np.ndarray, noise: np.ndarray) -> tuple[Any, Any]:
-    """Scripted policies in our environment: reward and success, (task, goal, step) each."""
+def port_episodes(port: Port, goals: np.ndarray, noise: np.ndarray) -> tuple[Any, Any, Any]:
+    """Scripted policies in our environment: reward and success, (task, goal, step) each, faults.
+
+    Faults (task, goal) count how often the physics of an episode became non-finite.
+    """
     tasks, count = goals.shape[:2]
     task_ids = np.repeat(np.arange(tasks, dtype=np.int32), count)
     policies = [scripted_policy(TASKS[i]) for i in task_ids]
@@ -286,7 +297,8 @@ def port_episodes(port: Port, goals: np.ndarray, noise: np.ndarray) -> tuple[Any
         rewards.append(np.asarray(state.reward))
         successes.append(np.asarray(state.success))
     shape = (tasks, count, -1)
-    return np.stack(rewards, 1).reshape(shape), np.stack(successes, 1).reshape(shape)
+    reward, success = (np.stack(x, 1).reshape(shape) for x in (rewards, successes))
+    return reward, success, np.asarray(state.faults).reshape(tasks, count)
 
 
 def reference_episodes(goals: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -304,8 +316,12 @@ def reference_episodes(goals: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray
 
 def measure_closed_loop(port: Port, goals: np.ndarray, noise: np.ndarray) -> list[dict[str, Any]]:
     """Part 4: scripted policies on both sides, under the same noise (task, goal, step, 4)."""
-    ours, theirs = port_episodes(port, goals, noise), reference_episodes(goals, noise)
-    return [_compare(*(x[i] for x in (*ours, *theirs))) for i in range(len(TASKS))]
+    *ours, faults = port_episodes(port, goals, noise)
+    theirs = reference_episodes(goals, noise)
+    return [
+        _compare(*(x[i] for x in (*ours, *theirs))) | {"faults": int(faults[i].sum())}
+        for i in range(len(TASKS))
+    ]
 
 
 def _compare(
@@ -315,7 +331,6 @@ def _compare(
     ours, theirs = _summary(reward, success), _summary(their_reward, their_success)
     return ours | {
         "return_ratio": ours["return"] / theirs["return"],
-        "nonfinite_lanes": int((~np.isfinite(reward)).any(-1).sum()),
         **{f"reference_{name}": value for name, value in theirs.items()},
     }
 

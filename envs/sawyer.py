@@ -15,8 +15,8 @@ import numpy as np
 from flax import struct
 
 from envs import rewards
-from envs.model import SLIDE, load_scene
 from envs.mjx_physics import MjxPhysics, PhysicsState, Positions
+from envs.model import SLIDE, load_scene
 from envs.tasks import (
     ACTION_SCALE,
     HAND_HIGH,
@@ -32,8 +32,7 @@ OBS_SIZE, ACTION_SIZE, FRAME = 39, 4, 18
 SETTLE_STEPS, FRAME_SKIP = 50, 5  # SawyerXYZEnv._reset_hand
 
 
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """One lane's environment state."""
 
     physics: PhysicsState
@@ -140,7 +139,7 @@ class Ml4Env:
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """One control step. `action` (4,): hand displacement / 0.01 m, finger effort, in [-1, 1]."""
+        """One control step; `action` (4,) in [-1, 1]: hand displacement / 0.01 m, finger effort."""
         action = jnp.clip(action, -1.0, 1.0)
         mocap = state.physics.mocap + action[:3] * ACTION_SCALE
         mocap = jnp.clip(mocap, jnp.array(HAND_LOW), jnp.array(HAND_HIGH))

@@ -108,7 +108,7 @@ def solve(
 
 
 def line_search(x, jv, gradient, mass_search, search, weight, rows, always, iterations):
-    """Minimiser of the convex, piecewise quadratic cost along `search`, by bracketed Newton steps."""
+    """Minimiser of the convex, piecewise quadratic cost along `search`: bracketed Newton steps."""
     curvature_smooth = search @ mass_search
     # Slope of the smooth part at 0: gradient less the active rows' share.
     slope_smooth = gradient @ search - jnp.sum(weight * x * jv)
