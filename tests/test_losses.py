@@ -14,14 +14,17 @@ LOG_PROB = RNG.normal(size=(TASKS, BATCH))
 REWARD = RNG.normal(size=(TASKS, BATCH))
 DISCOUNT = RNG.choice([0.0, 0.9], size=(TASKS, BATCH))
 ALPHA = np.array([0.1, 1.0, 3.0])
+q, log_prob, reward, discount, alpha = (
+    jnp.asarray(x) for x in (Q, LOG_PROB, REWARD, DISCOUNT, ALPHA)
+)
 
 
 def test_target_and_losses_match_loops():
-    value = losses.soft_value(Q, LOG_PROB, ALPHA)
-    target = losses.td_target(REWARD, DISCOUNT, value)
-    got_critic = losses.critic_loss(jnp.asarray(Q + 1), target)
-    got_actor = losses.actor_loss(Q, LOG_PROB, ALPHA)
-    got_value = losses.value_loss(jnp.asarray(REWARD), value)
+    value = losses.soft_value(q, log_prob, alpha)
+    target = losses.td_target(reward, discount, value)
+    got_critic = losses.critic_loss(q + 1, target)
+    got_actor = losses.actor_loss(q, log_prob, alpha)
+    got_value = losses.value_loss(reward, value)
     for i in range(TASKS):
         critic = actor = value_loss = 0.0
         for b in range(BATCH):
@@ -43,9 +46,14 @@ def test_targets_carry_no_gradient():
             x[None, :, :, None] * jnp.ones((2, 1, 1, BINS)), x, x, x, jnp.ones(TASKS),
             losses.critic_support(2.0, BINS), "mean",
         )  # fmt: skip
-        return jnp.sum(target) + jnp.sum(bins**2) + clipped + jnp.sum(losses.value_loss(0.0, x))
+        return (
+            jnp.sum(target)
+            + jnp.sum(bins**2)
+            + clipped
+            + jnp.sum(losses.value_loss(jnp.zeros(()), x))
+        )
 
-    assert np.all(jax.grad(through_target)(jnp.asarray(REWARD)) == 0.0)
+    assert np.all(jax.grad(through_target)(reward) == 0.0)
 
 
 def c51_by_loop(probabilities, values, support):
@@ -64,7 +72,7 @@ def test_categorical_target_matches_a_loop(aggregate):
     support = np.linspace(-2.0, 2.0, BINS)
     logits = RNG.normal(scale=2.0, size=(2, TASKS, BATCH, BINS))
     target, clipped = losses.categorical_target(
-        jnp.asarray(logits), LOG_PROB, REWARD, DISCOUNT, ALPHA,
+        jnp.asarray(logits), log_prob, reward, discount, alpha,
         losses.critic_support(2.0, BINS), aggregate,
     )  # fmt: skip
     probabilities = np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)

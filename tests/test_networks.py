@@ -1,6 +1,7 @@
 """Soft-modular forward against plain numpy loops, initial ranges, conditioning, twin critics."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -110,7 +111,8 @@ def test_soft_modular_forward_matches_loops(modules, router_input, trunk_input, 
     x = rng.normal(size=(TASKS, BATCH, FEATURES)).astype(np.float32)
     z = rng.normal(size=(TASKS, 1, LATENT)).astype(np.float32)
     params = spread(net.init(jax.random.key(0), x, z))
-    y, routing = net.apply(params, x, z)
+    result: Any = net.apply(params, x, z)
+    y, routing = result
     assert y.shape == (TASKS, BATCH, OUT)
     per_sample = 1 if router_input == "z" else BATCH
     assert routing.matrices.shape == (TASKS, per_sample, modules - 1, modules, modules)
