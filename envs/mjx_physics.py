@@ -145,7 +145,7 @@ class MjxPhysics:
         data = self._data.replace(
             qpos=state.qpos[:ROBOT_JOINTS], qvel=state.qvel[:ROBOT_JOINTS], ctrl=ctrl
         )
-        data = self._smooth_dynamics(data)
+        data = _fence(self._smooth_dynamics(data))
         fixture = scene.fixture
         mass = jnp.zeros((JOINTS, JOINTS)).at[:ROBOT_JOINTS, :ROBOT_JOINTS].set(data._impl.M)
         mass = mass.at[SLIDE, SLIDE].set(fixture.inertia)
@@ -154,6 +154,7 @@ class MjxPhysics:
         force = jnp.append(data.qfrc_smooth, slide_force)
         smooth = jnp.append(data.qacc_smooth, slide_force / fixture.inertia)
         rows, equalities = self._constraint_rows(state, data, scene)
+        rows = _fence(rows)
         acceleration, constraint_force = solve(
             mass,
             force,
@@ -188,14 +189,16 @@ class MjxPhysics:
     def _constraint_rows(self, state: PhysicsState, data: mjx.Data, scene: SceneData):
         pos, rot = data.xpos[ARM_JOINTS], data.xmat[ARM_JOINTS]
         handle_shift = state.placement + scene.fixture.axis * state.qpos[SLIDE]
-        torsional, smooth = find_contacts(
-            self._gripper,
-            scene.shapes,
-            pos,
-            rot,
-            state.qpos[RIGHT_FINGER : LEFT_FINGER + 1],
-            state.placement,
-            handle_shift,
+        torsional, smooth = _fence(
+            find_contacts(
+                self._gripper,
+                scene.shapes,
+                pos,
+                rot,
+                state.qpos[RIGHT_FINGER : LEFT_FINGER + 1],
+                state.placement,
+                handle_shift,
+            )
         )
         weld = self._weld_rows(state, data, pos, rot)
         groups = [
@@ -220,8 +223,12 @@ class MjxPhysics:
         turned = 0.5 * jax.vmap(turn)(-rotate * WELD_TORQUE_SCALE)
         jacobian = jnp.concatenate([-translate.T, turned.T])
         error = jnp.concatenate([error, twist])
+        # MuJoCo takes the change of the Jacobian into account for equalities (and only there).
+        speed, linear, angular = self._velocity_product(state, data, hand)
+        turning = 0.5 * turn(-angular * WELD_TORQUE_SCALE) - 0.25 * (speed @ speed) * twist
+        drift = jnp.concatenate([-linear, turning])
         ones = jnp.ones(6)
-        return make_rows(
+        rows = make_rows(
             jacobian=jnp.pad(jacobian, ((0, 0), (0, 1))),
             pos=error,
             impedance_pos=jnp.linalg.norm(error) * ones,
@@ -232,6 +239,7 @@ class MjxPhysics:
             timestep=self.timestep,
             active=ones,
         )
+        return rows._replace(reference=rows.reference - drift)
 
     def _limit_rows(self, state: PhysicsState, scene: SceneData) -> Rows:
         """Ten joint limits, and the two slide positions where the fixture meets a static part."""
@@ -308,12 +316,34 @@ class MjxPhysics:
             active=spread((pos < 0).astype(jnp.float32)),
         )
 
+    def _velocity_product(self, state: PhysicsState, data: mjx.Data, point: jax.Array):
+        """What a point on the last arm link does when no joint accelerates.
+
+        Returns:
+            The link's angular velocity, the point's acceleration and the link's angular
+            acceleration, (3,) each: the Jacobians' time derivatives times the joint velocity.
+        """
+        anchor = data.xanchor[:ARM_JOINTS]
+        spin = data.xaxis[:ARM_JOINTS] * state.qvel[:ARM_JOINTS, None]
+        # Link j moves a point x at omega_j cross x - moment_j.
+        omega = jnp.cumsum(spin, 0)
+        moment = jnp.cumsum(jnp.cross(spin, anchor), 0)
+        turn = jnp.cross(omega, spin)
+        relative = (jnp.cross(omega[-1], point) - moment[-1]) - (jnp.cross(omega, anchor) - moment)
+        linear = jnp.cross(turn, point - anchor) + jnp.cross(spin, relative)
+        return omega[-1], linear.sum(0), turn.sum(0)
+
     def _robot_jacobian(self, data: mjx.Data, point: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Jacobians (robot joint, 3) of a world point riding on the last arm link."""
         arm = slice(0, ARM_JOINTS)
         rotate = jnp.zeros((ROBOT_JOINTS, 3)).at[arm].set(data.xaxis[arm])
         translate = jnp.cross(rotate, point - data.xanchor)
         return translate, rotate
+
+
+def _fence(tree: Any) -> Any:
+    """Keeps XLA from fusing across a stage: it would recompute the stage for every consumer."""
+    return jax.lax.optimization_barrier(tree)
 
 
 def _float32(value: Any) -> jax.Array:
