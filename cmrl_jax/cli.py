@@ -1,4 +1,4 @@
-"""Command line: `train` (the default), `eval` and `bench`.
+"""Command line: `train` (the default), `eval`, `plot` and `bench`.
 
 A user's mistake is one line of cause, one of cure and exit code 2, before jax is imported; any
 other exception keeps its traceback. jax and mujoco are imported by the commands alone, so that
@@ -29,9 +29,9 @@ from cmrl_jax.run_dir import config_stem, find_run, new_run, resumed_run
 from cmrl_jax.stop import StopSignal
 from cmrl_jax.validate import check_goal_set
 
-COMMANDS = ("train", "eval", "bench")
+COMMANDS = ("train", "eval", "plot", "bench")
 # Commands and options of the design whose code is not there yet: refused by name.
-NOT_BUILT = ("sweep", "finetune", "render", "plot", "goals")
+NOT_BUILT = ("sweep", "finetune", "render", "goals")
 EVAL_NOT_BUILT = {"z": ("prior", "shuffled", "other", "text"), "physics": ("native", "metaworld")}
 
 
@@ -64,7 +64,7 @@ def _dispatch(words: list[str]) -> int:
         near = suggest(command, COMMANDS)
         cure = f"{near}commands: {', '.join(COMMANDS)}; train needs --config ml4.yaml"
         raise ConfigError(f"unknown command '{command}'", cure)
-    return {"train": _train, "eval": _eval, "bench": _bench}[command](words)
+    return {"train": _train, "eval": _eval, "plot": _plot, "bench": _bench}[command](words)
 
 
 def _parse(parser: argparse.ArgumentParser, words: list[str]) -> argparse.Namespace:
@@ -240,6 +240,29 @@ def _eval(words: list[str]) -> int:
         checkpoint=args.checkpoint,
         json_path=args.json,
     )
+
+
+def plot_parser() -> argparse.ArgumentParser:
+    """Flags of `plot`."""
+    parser = _Parser(
+        prog="python train.py plot",
+        description="Draws success per task over env steps from a run's metrics.csv.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--run", metavar="DIR", type=Path, required=True, help="run directory")
+    parser.add_argument("--out", metavar="F", type=Path, help="picture [DIR/success.png]")
+    return parser
+
+
+def _plot(words: list[str]) -> int:
+    args = _parse(plot_parser(), words)
+
+    from cmrl_jax import plots
+
+    out = args.out or args.run / "success.png"
+    plots.plot_success(args.run, out)
+    print(out)
+    return 0
 
 
 def bench_parser() -> argparse.ArgumentParser:

@@ -1,0 +1,264 @@
+"""The loop end to end at smoke size, through the command line, on real physics.
+
+One run of `smoke.yaml` (module fixture) is compared with its repetition, its resumption and a run
+stopped by a signal; the presets run two iterations each.
+"""
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from cmrl_jax.checkpoint import full_store, policy_store
+from cmrl_jax.cli import main
+from cmrl_jax.collect import init_run, make_train_iteration
+from cmrl_jax.config import lane_groups
+from cmrl_jax.config_io import load_config
+from cmrl_jax.session import Session, policy_params
+
+ROOT = Path(__file__).resolve().parent.parent
+ITERATIONS = 3
+
+
+def smoke(run, *words):
+    return main(["--config", "smoke.yaml", "--run", str(run), *words])
+
+
+def rows_of(run):
+    """Rows of metrics.csv as text, without the columns that depend on the clock."""
+    with open(run / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    is_clock = lambda column: column == "wall_s" or column.startswith("time/")
+    return [{c: text for c, text in row.items() if not is_clock(c)} for row in rows]
+
+
+def checkpoint_leaves(run):
+    """{path: array} of the newest full checkpoint."""
+    config = load_config(str(run / "config.yaml"))
+    learner = Session(config).learner
+    state = jax.eval_shape(lambda key: init_run(config, learner, key), jax.random.key(0))
+    abstract = {
+        "learner": {"state": state.learner, "key": state.key, "iteration": state.iteration},
+        "replay": state.replay,
+        "context": state.context,
+    }
+    with full_store(run, read_only=True) as store:
+        trees, meta = store.restore(abstract)
+    leaves = jax.tree_util.tree_leaves_with_path(trees)
+    plain = lambda x: (
+        jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    )
+    return {jax.tree_util.keystr(p): np.asarray(plain(x)) for p, x in leaves}, meta
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished smoke run, and the number of programs that were compiled ahead of time."""
+    run = tmp_path_factory.mktemp("train") / "run"
+    compiles = []
+    with pytest.MonkeyPatch.context() as patch:
+        original = jax.stages.Lowered.compile
+
+        def counted(self, *args, **kwargs):
+            compiles.append(self)
+            return original(self, *args, **kwargs)
+
+        patch.setattr(jax.stages.Lowered, "compile", counted)
+        assert smoke(run) == 0
+    return run, len(compiles)
+
+
+def test_a_run_leaves_what_the_design_lists(finished):
+    run, compiles = finished
+    names = {"config.yaml", "versions.json", "metrics.csv", "eval.json", "ckpt", "policy"}
+    assert names <= {p.name for p in run.iterdir()}
+    rows = rows_of(run)
+    assert [row["iteration"] for row in rows] == ["0", "1", "2"]
+    assert [row["env_steps"] for row in rows] == ["600", "1200", "1800"]
+    assert [row["gradient_steps"] for row in rows] == ["0", "50", "100"]
+    evaluated = [row["eval/window-close/k1/success_any"] for row in rows]
+    assert evaluated[:1] == [""] and evaluated[1] != ""
+    assert rows[0]["train/critic_loss"] == "" and float(rows[1]["train/critic_loss"]) > 0
+    with full_store(run, read_only=True) as store:
+        assert store.steps() == [2, 3]
+    assert compiles == 2  # one training iteration, one evaluation episode: no third physics program
+
+
+def test_every_figure_is_finite(finished):
+    for row in rows_of(finished[0]):
+        for name, text in row.items():
+            assert text == "" or np.isfinite(float(text)), name
+        assert row["train/physics_faults"] == "0.0"
+        assert row["train/skipped"] in ("", "0.0")
+
+
+def test_episodes_come_from_the_groups_that_the_config_asks_for(finished):
+    rows = rows_of(finished[0])
+    prior, text, posterior = lane_groups(load_config("smoke.yaml"))
+    counts = [[row[f"train/episodes_{s}"] for s in ("prior", "text", "posterior")] for row in rows]
+    # Iteration 0 has no context yet: its posterior lanes fall back on the text.
+    assert counts[0] == [f"{3 * prior}.0", f"{3 * (text + posterior)}.0", "0.0"]
+    assert counts[1] == counts[2] == [f"{3 * prior}.0", f"{3 * text}.0", f"{3 * posterior}.0"]
+
+
+def test_the_same_seed_gives_the_same_csv_and_another_seed_does_not(finished, tmp_path):
+    assert smoke(tmp_path / "same") == 0
+    assert rows_of(tmp_path / "same") == rows_of(finished[0])
+    assert smoke(tmp_path / "other", "--seed", "1", "--train.env_steps", "600") == 0
+    first, other = rows_of(finished[0])[0], rows_of(tmp_path / "other")[0]
+    assert first["train/drawer-open/return"] != other["train/drawer-open/return"]
+
+
+def test_resume_equals_an_undisturbed_run_bit_for_bit(finished, tmp_path):
+    run = tmp_path / "run"
+    assert smoke(run, "--train.env_steps", "600") == 0
+    assert len(rows_of(run)) == 1
+    assert smoke(run, "--resume") == 0
+    assert rows_of(run) == rows_of(finished[0])
+    resumed, meta = checkpoint_leaves(run)
+    straight, straight_meta = checkpoint_leaves(finished[0])
+    assert resumed.keys() == straight.keys() and len(resumed) > 30
+    for path, leaf in straight.items():
+        np.testing.assert_array_equal(resumed[path], leaf, err_msg=path)
+    assert meta["iteration"] == straight_meta["iteration"] == ITERATIONS
+
+
+def test_a_run_killed_before_its_first_save_resumes_from_the_start(finished, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(finished[0] / "config.yaml", run)
+    assert main(["--run", str(run), "--resume", "--train.env_steps", "600"]) == 0
+    assert rows_of(run)[0] == rows_of(finished[0])[0]
+
+
+def test_resume_refuses_a_changed_field_by_name(finished, refused):
+    cause, cure = refused("--run", str(finished[0]), "--resume", "--sac.gamma", "0.9")
+    assert "sac.gamma" in cause and cure
+
+
+def test_sigterm_saves_and_leaves_with_code_0_and_the_resume_command(finished, tmp_path):
+    run = tmp_path / "run"
+    command = [sys.executable, str(ROOT / "train.py"), "--config", "smoke.yaml", "--run", str(run)]
+    command += ["--train.env_steps", "60000"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=tmp_path
+    )
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if line.startswith("iter    1"):
+            process.send_signal(signal.SIGTERM)
+    assert process.wait(120) == 0, lines
+    assert f"train.py --run {run} --resume" in lines[-1], lines
+    rows = rows_of(run)
+    assert rows[:2] == rows_of(finished[0])[:2]
+    with full_store(run, read_only=True) as store:
+        assert store.read_meta()["iteration"] == len(rows)
+
+
+def test_sigterm_during_the_compile_stops_before_the_first_iteration(tmp_path):
+    """A signal before the loop leaves the untrained state and a command that goes on with it."""
+    run = tmp_path / "run"
+    command = [sys.executable, str(ROOT / "train.py"), "--config", "smoke.yaml", "--run", str(run)]
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+    )
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if line.startswith("compiling the training iteration ..."):
+            process.send_signal(signal.SIGTERM)
+    assert process.wait(300) == 0, lines
+    assert re.search(r"stopped after iteration 0; .*--resume", lines[-1]), lines
+    assert rows_of(run) == []
+    with full_store(run, read_only=True) as store:
+        assert store.steps() == [0]
+
+
+def test_eval_restores_the_policy_in_another_process(finished, tmp_path):
+    """The same goals, k and seed as the run's own final evaluation: the same figures."""
+    out = tmp_path / "eval.json"
+    words = ["eval", "--run", str(finished[0]), "--k", "0,1", "--goals", "2", "--json", str(out)]
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), *words], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    result, own = (json.loads(path.read_text()) for path in (out, finished[0] / "eval.json"))
+    assert result["tasks"] == own["tasks"]
+    assert list(result["tasks"]) == ["drawer-open", "drawer-close", "window-open", "window-close"]
+    assert {"success_any", "success_last", "return"} <= result["tasks"]["window-close"]["1"].keys()
+    assert (result["goals"], result["horizon"]) == (2, 50)
+    assert "window-close" in done.stdout and "any step" in done.stdout
+
+
+def test_evaluation_does_not_depend_on_the_order_of_tasks_or_on_what_was_evaluated_before(finished):
+    """Trap 8: a belief that survived from one task to the next would change these figures."""
+    config = load_config(str(finished[0] / "config.yaml"))
+    session = Session(config)
+    state = jax.eval_shape(session.learner.init, jax.random.key(0))
+    abstract = {
+        "params": policy_params(state),
+        "goal_vectors": jax.eval_shape(lambda: session.goals.vectors[:, 0]),
+    }
+    with policy_store(finished[0], read_only=True) as store:
+        params = store.restore({"policy": abstract})[0]["policy"]["params"]
+    evaluator = session.evaluator()
+    placements = session.placements("heldout", config.eval.goals)
+    first = evaluator.run(params, placements, (0, 1), seed=0)
+    again = evaluator.run(params, placements, (1,), seed=0)
+    np.testing.assert_array_equal(first[1].returns, again[1].returns)
+    other = evaluator.run(params, placements, (1,), seed=1)
+    assert not np.array_equal(first[1].returns, other[1].returns)  # z is drawn
+    # One goal a task in a padded batch scores as it does among others.
+    alone = evaluator.run(params, placements[:, :1], (1,), seed=0)
+    np.testing.assert_allclose(alone[1].returns[:, 0], first[1].returns[:, 0], rtol=1e-4)
+
+
+PRESETS = ("ml4", "pearl", "cmrl-paper", "mtsac", "sac", "ml4-large")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_each_preset_runs_two_iterations_at_smoke_size(preset):
+    config = load_config(f"{preset}.yaml")
+    small = load_config("smoke.yaml")
+    tasks, layers = len(config.tasks.train), config.model.modules[:2]
+    config = dataclasses.replace(
+        config,
+        env=dataclasses.replace(config.env, horizon=20),
+        model=dataclasses.replace(
+            config.model, modules=(*layers, 8), trunk_width=16, gating_width=8, mlp_hidden=(16, 16)
+        ),
+        encoder=dataclasses.replace(config.encoder, hidden=(16, 16), context_max=8),
+        sac=dataclasses.replace(config.sac, batch=8, task_rows=2 * bool(config.sac.task_rows)),
+        collect=dataclasses.replace(config.collect, lanes=4 * tasks, updates_per_vector_step=1),
+        train=dataclasses.replace(small.train, capacity=400),
+    )
+    session = Session(config)
+    iteration = make_train_iteration(
+        config, session.env, session.learner, session.train_goals, session.train_placements()
+    )
+    program = jax.jit(iteration)
+    state = init_run(config, session.learner, jax.random.key(0))
+    state, first = program(state)
+    before = state.learner.actor_params
+    state, second = program(state)
+    assert np.isnan(first["critic_loss"]) and np.isfinite(second["critic_loss"])
+    for name, value in second.items():
+        assert np.all(np.isfinite(value)), name
+    assert int(state.learner.gradient_steps) == 20 and float(second["skipped"]) == 0
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), before, state.learner.actor_params)
+    assert all(jax.tree.leaves(moved))
+    assert program._cache_size() == 1  # two calls, one trace: no weak type crept into the state
