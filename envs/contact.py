@@ -1,6 +1,6 @@
 """Narrow-phase collision of gripper shapes with fixture shapes, and the choice of contacts to keep.
 
-Per lane and substep there are 24 + 9 + 17 candidate points; only a few can be in contact at once,
+Per lane and substep there are 24 + 15 + 23 candidate points; only a few can be in contact at once,
 and each kept point costs the solver four to six rows. So every family keeps its deepest few.
 All functions are for one lane; callers vmap. Distances in metres, world frame.
 """
@@ -135,9 +135,9 @@ def base_capsule_contacts(
     link_rot: jax.Array,
     handle_shift: jax.Array,
 ) -> Contacts:
-    """Gripper base capsules (3) against handle capsules (3), one point a pair."""
+    """Gripper base capsules (5) against handle capsules (3), one point a pair."""
     ends = link_pos + jnp.asarray(gripper.base_ends) @ link_rot.T
-    p, d1 = ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None]  # (3, 1, 3)
+    p, d1 = ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None]  # (5, 1, 3)
     handle = shapes.capsule_ends + handle_shift
     q, d2 = handle[None, :, 0], (handle[:, 1] - handle[:, 0])[None]
     r = p - q
@@ -176,15 +176,15 @@ def sphere_box_contacts(
     placement: jax.Array,
     handle_shift: jax.Array,
 ) -> Contacts:
-    """Each gripper sphere (17) against the box it is deepest in: case, panels, frame, table."""
+    """Each gripper sphere (23) against the box it is deepest in: case, panels, frame, table."""
     slide = jnp.concatenate([jnp.zeros(1), finger_slide])[gripper.sphere_part]
     axis = jnp.concatenate([jnp.zeros((1, 3)), gripper.finger_axis])[gripper.sphere_part]
-    center = link_pos + (gripper.sphere_center + axis * slide[:, None]) @ link_rot.T  # (17, 3)
+    center = link_pos + (gripper.sphere_center + axis * slide[:, None]) @ link_rot.T  # (23, 3)
     placed = jnp.asarray(shapes.box_placed)[:, None]
     moves = jnp.asarray(shapes.box_moves)[:, None]
     box = shapes.box_center + placed * placement + moves * (handle_shift - placement)  # (BOXES, 3)
     local = center[:, None] - box[None]
-    dist, _ = point_box(local, jnp.asarray(shapes.box_half)[None])  # (17, BOXES)
+    dist, _ = point_box(local, jnp.asarray(shapes.box_half)[None])  # (23, BOXES)
     nearest = jnp.argmin(dist, 1)
     local = jnp.take_along_axis(local, nearest[:, None, None], 1)[:, 0]
     dist, normal = point_box(local, jnp.asarray(shapes.box_half)[nearest])
