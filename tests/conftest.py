@@ -30,3 +30,22 @@ def refused(capsys):
         return lines[0].removeprefix("error: "), lines[1].removeprefix("fix: ")
 
     return run
+
+
+# For the environment's tests; imported when asked for, since metaworld and mjx take seconds.
+
+
+@pytest.fixture(scope="session")
+def port():
+    """One compiled step of the environment for all tests: `env_fixtures.CountedPort`."""
+    from env_fixtures import CountedPort
+
+    return CountedPort()
+
+
+@pytest.fixture(scope="session")
+def rollouts():
+    """Recorded episodes of Meta-World, three a task: scripted, perturbed, random."""
+    from env_fixtures import record
+
+    return record()
