@@ -156,7 +156,7 @@ def make_objectives(
     def critic(trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
         zc, kl = infer(trained.encoder, data)
         alpha = jnp.exp(log_alpha)[data.task_ids]
-        zb = stop_gradient(zc)
+        zb = stop_gradient(zc)  # the target is stopped as a whole; this spares tracing its tangents
         target, clipped = critic_target(actor_params, target_params, alpha, zb, data)
         head = networks.critic(trained.critic, data.obs, data.action, zc[:, None])
         loss_of = losses.categorical_critic_loss if is_categorical else losses.critic_loss

@@ -16,9 +16,9 @@ TASKS, BATCH, FEATURES, LATENT = 2, 3, 5, 4
 TRUNK, GATING, WIDTH, OUT = 6, 5, 4, 2
 
 
-def make_net(modules, router_input="z*obs", trunk_input="obs", norm=False, temperature=1.0):
+def make_net(layers, modules, router_input="z*obs", trunk_input="obs", norm=False, temperature=1.0):
     return SoftModularNet(
-        layers=modules,
+        layers=layers,
         modules=modules,
         module_width=WIDTH,
         trunk_width=TRUNK,
@@ -40,7 +40,7 @@ def spread(params, seed=0):
     )
 
 
-def forward_by_loops(p, x, z, n, router_input, trunk_input, norm, temperature):
+def forward_by_loops(p, x, z, layers, n, router_input, trunk_input, norm, temperature):
     """One sample of algorithm section 3 in float64, module by module."""
     p = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), p)
 
@@ -71,7 +71,7 @@ def forward_by_loops(p, x, z, n, router_input, trunk_input, norm, temperature):
 
     outputs = [module(0, j, relu(f)) for j in range(n)]
     routings = []
-    for layer in range(1, n):
+    for layer in range(1, layers):
         if layer == 1:
             gate = e
         else:
@@ -97,16 +97,18 @@ def forward_by_loops(p, x, z, n, router_input, trunk_input, norm, temperature):
 
 
 @pytest.mark.parametrize(
-    ("modules", "router_input", "trunk_input", "norm", "temperature"),
+    ("layers", "modules", "router_input", "trunk_input", "norm", "temperature"),
     [
-        (2, "z*obs", "obs", False, 1.0),
-        (2, "z*obs", "obs", True, 1.0),
-        (3, "z*obs", "obs", False, 2.0),
-        (3, "z", "obs_z", True, 1.0),
+        (2, 2, "z*obs", "obs", False, 1.0),
+        (2, 2, "z*obs", "obs", True, 1.0),
+        (3, 3, "z*obs", "obs", False, 2.0),
+        (4, 3, "z", "obs_z", True, 1.0),
     ],
 )
-def test_soft_modular_forward_matches_loops(modules, router_input, trunk_input, norm, temperature):
-    net = make_net(modules, router_input, trunk_input, norm, temperature)
+def test_soft_modular_forward_matches_loops(
+    layers, modules, router_input, trunk_input, norm, temperature
+):
+    net = make_net(layers, modules, router_input, trunk_input, norm, temperature)
     rng = np.random.default_rng(0)
     x = rng.normal(size=(TASKS, BATCH, FEATURES)).astype(np.float32)
     z = rng.normal(size=(TASKS, 1, LATENT)).astype(np.float32)
@@ -115,15 +117,15 @@ def test_soft_modular_forward_matches_loops(modules, router_input, trunk_input, 
     y, routing = result
     assert y.shape == (TASKS, BATCH, OUT)
     per_sample = 1 if router_input == "z" else BATCH
-    assert routing.matrices.shape == (TASKS, per_sample, modules - 1, modules, modules)
+    assert routing.matrices.shape == (TASKS, per_sample, layers - 1, modules, modules)
     assert routing.final.shape == (TASKS, per_sample, modules)
     np.testing.assert_allclose(np.sum(routing.matrices, axis=-1), 1.0, atol=1e-6)
     np.testing.assert_allclose(np.sum(routing.final, axis=-1), 1.0, atol=1e-6)
     for i in range(TASKS):
         for b in range(BATCH):
             expected = forward_by_loops(
-                params["params"], x[i, b], z[i, 0], modules, router_input, trunk_input, norm,
-                temperature,
+                params["params"], x[i, b], z[i, 0], layers, modules, router_input, trunk_input,
+                norm, temperature,
             )  # fmt: skip
             at = min(b, per_sample - 1)
             np.testing.assert_allclose(y[i, b], expected[0], rtol=2e-4, atol=2e-5)
@@ -137,7 +139,7 @@ def range_of(leaf):
 
 def test_official_initial_ranges_scale_with_the_number_of_outputs():
     """Kernels (in, out) fill U(+-1/sqrt(out)); in and out differ, so fan-in would fail."""
-    net = replace(make_net(2), trunk_width=16, gating_width=64, module_width=25)
+    net = replace(make_net(2, 2), trunk_width=16, gating_width=64, module_width=25)
     p = net.init(jax.random.key(1), jnp.zeros((1, 200)), jnp.zeros((1, 100)))["params"]
     hidden = {"trunk_0": 16, "trunk_1": 16, "embedding": 16, "gating_0": 64, "gating_1": 64}
     for name, outputs in (hidden | {"routing_in_final": 64, "modules_0": 25}).items():
@@ -150,7 +152,7 @@ def test_official_initial_ranges_scale_with_the_number_of_outputs():
 
 
 def test_flax_initial_ranges():
-    net = replace(make_net(2), initialisers=make_initialisers("flax"), module_width=25)
+    net = replace(make_net(2, 2), initialisers=make_initialisers("flax"), module_width=25)
     p = net.init(jax.random.key(1), jnp.zeros((1, 200)), jnp.zeros((1, 100)))["params"]
     for name, inputs in {"trunk_0": 200, "embedding": 100, "modules_1": 25}.items():
         bound = np.sqrt(6.0 / inputs)
