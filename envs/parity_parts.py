@@ -6,7 +6,7 @@ states, actions, noise and goals; lanes are ordered task first, goal second. Len
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -50,6 +50,7 @@ class Port:
             positions = env.physics.positions(state.physics, scene_id[state.task_id])
             return env.observe(state, state.physics, positions, action)
 
+        self.env = env
         self.observe = jax.jit(jax.vmap(observe))
         self.observe_positions = jax.jit(
             jax.vmap(lambda state, positions, a: env.observe(state, state.physics, positions, a))
@@ -133,14 +134,16 @@ def quantiles(errors: np.ndarray) -> dict[str, float]:
     }
 
 
-def measure_injected(port: Port, rollouts: list[Rollout]) -> list[dict[str, Any]]:
+def measure_injected(
+    port: Port, rollouts: list[Rollout], tasks: Sequence[str] = TASKS
+) -> list[dict[str, Any]]:
     """Parts 1 and 2: observation, reward and success in given states, and one step from them."""
-    return [_injected_task(port, task, [r for r in rollouts if r.task == task]) for task in TASKS]
+    return [_injected_task(port, task, [r for r in rollouts if r.task == task]) for task in tasks]
 
 
 def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, Any]:
     reference = ReferenceEnv(task)
-    states, actions, positions, before, onward, contact = [], [], [], [], [], []
+    states, actions, exact, before, onward, contact = [], [], [], [], [], []
     reward, success, distance, obs, qpos, hand = [], [], [], [], [], []
     for rollout in rollouts:
         rows = np.arange(1, len(rollout.action), ROW_STRIDE)
@@ -155,13 +158,13 @@ def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, 
             reward.append(verdict[1])
             success.append(verdict[2])
             distance.append(verdict[3]["obj_to_target"])
-            positions.append(_positions(reference))
+            exact.append(positions(reference))
             touching = _touching(reference)
             reference.inject(rollout.state(row + 1), rollout.action[row])
             contact.append(touching or _touching(reference))
             hand.append(reference.positions().hand)
     stack = lambda trees: jax.tree.map(lambda *x: np.concatenate(x), *trees)
-    exact = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *positions)
+    exact = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *exact)
     states, action = stack(states), np.concatenate(actions)
     ours = port.in_pieces(port.observe, states, action)
     logic = port.in_pieces(port.observe_positions, states, exact, action)
@@ -195,7 +198,8 @@ def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, 
     }
 
 
-def _positions(reference: ReferenceEnv) -> Positions:
+def positions(reference: ReferenceEnv) -> Positions:
+    """What our `observe` reads, from Meta-World's simulator as it stands; float64 leaves."""
     exact: Any = reference.positions()
     gap: Any = np.linalg.norm(exact.right_finger - exact.left_finger)
     data: Any = reference.env.data

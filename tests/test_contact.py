@@ -1,0 +1,211 @@
+"""Collision geometry against MuJoCo's: distances of the scene's own geoms, mixed parameters."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from env_fixtures import GOALS
+
+from envs.contact import (
+    base_capsule_contacts,
+    finger_capsule_contacts,
+    mix,
+    point_box,
+    sphere_box_contacts,
+)
+from envs.geometry import Material, load_gripper, load_shapes
+from envs.model import FIXTURE_BODY, LEFT_FINGER, RIGHT_FINGER, SLIDE, load_fixture, load_scene
+from envs.reference import ReferenceEnv
+from envs.tasks import SPECS, TASKS
+
+SCENE = {spec.name: spec.scene for spec in SPECS}
+FINGERS = ("rightclaw_it", "rightpad_geom", "leftclaw_it", "leftpad_geom")
+
+
+def test_point_box_equals_mujocos_distance():
+    half = np.array([0.3, 0.2, 0.1])
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom type='box' size='.3 .2 .1'/>"
+        "<body><freejoint/><inertial pos='0 0 0' mass='1' diaginertia='1 1 1'/>"
+        "<geom type='sphere' size='1e-6'/></body></worldbody></mujoco>"
+    )
+    data, segment = mujoco.MjData(model), np.zeros(6)
+    points = np.random.default_rng(0).uniform(-1.7, 1.7, (400, 3)) * half
+    dist, normal = jax.jit(point_box)(points, half)
+    for point, d, n in zip(points, dist, np.asarray(normal), strict=True):
+        data.qpos[:3] = point
+        mujoco.mj_kinematics(model, data)
+        expected = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, segment)
+        assert abs(d - expected) < 5e-6
+        assert abs(np.linalg.norm(n) - 1) < 1e-5
+        # Stepping back along the normal lands on the surface.
+        assert abs(np.max(np.abs(point - n * d) - half)) < 1e-5
+    assert (np.asarray(dist) < 0).mean() > 0.1
+
+
+@pytest.fixture(scope="module")
+def near_states(rollouts):
+    """Per task: data of Meta-World's simulator in states near contact, as a list of MjData."""
+    found = {}
+    for task in TASKS:
+        env, states = ReferenceEnv(task), []
+        for rollout in (r for r in rollouts if r.task == task and r.action.std() > 0):
+            for row in range(40, 160, 3):
+                env.inject(rollout.state(row), rollout.action[row - 1])
+                data = mujoco.MjData(env.env.model)
+                mujoco.mj_copyData(data, env.env.model, env.env.data)
+                states.append((data, rollout.rand_vec))
+        found[task] = (env, states)
+    return found
+
+
+def ours(task, states, family):
+    """Our contacts of one family in MuJoCo's states, leaves with a leading state axis."""
+    model = load_scene(SCENE[task])
+    gripper, shapes = load_gripper(model), load_shapes(SCENE[task], model)
+    axis = load_fixture(SCENE[task], model).axis
+    single = lambda tree: jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32 if np.asarray(x).dtype.kind == "f" else jnp.int32),
+        tree,
+    )
+    rows = [
+        (
+            data.body("right_l6").xpos,
+            data.body("right_l6").xmat.reshape(3, 3),
+            data.qpos[RIGHT_FINGER : LEFT_FINGER + 1],
+            place,
+            place + axis * data.qpos[SLIDE],
+        )
+        for data, place in states
+    ]
+    pos, rot, fingers, place, shift = single(tuple(np.stack(x) for x in zip(*rows, strict=True)))
+    arguments = {
+        finger_capsule_contacts: (pos, rot, fingers, shift),
+        base_capsule_contacts: (pos, rot, shift),
+        sphere_box_contacts: (pos, rot, fingers, place, shift),
+    }[family]
+    gripper, shapes = single(gripper), single(shapes)
+    return jax.jit(jax.vmap(lambda *x: family(gripper, shapes, *x)))(*arguments)
+
+
+def handle_capsules(task, model):
+    body = model.body(FIXTURE_BODY[SCENE[task]]).id
+    capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+    geoms = np.flatnonzero((model.geom_bodyid == body) & (model.geom_type == capsule))
+    return [g for g in geoms if model.geom_contype[g] | model.geom_conaffinity[g]]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_finger_boxes_touch_handles_where_mujocos_do(near_states, task):
+    env, states = near_states[task]
+    model = env.env.model
+    contacts = ours(task, states, finger_capsule_contacts)
+    dist = np.asarray(contacts.dist).reshape(len(states), 4, 3, 2).min(-1)
+    handles, near = handle_capsules(task, model), 0
+    for i, (data, _) in enumerate(states):
+        for j, finger in enumerate(FINGERS):
+            for k, handle in enumerate(handles):
+                box = model.geom(finger).id
+                expected = mujoco.mj_geomDistance(model, data, box, handle, 0.02, np.zeros(6))
+                if -0.004 < expected < 0.01:  # deeper, MuJoCo's own answer is approximate
+                    near += 1
+                    assert abs(dist[i, j, k] - expected) < 2e-4, (i, finger, k)
+    assert near > 10
+
+
+@pytest.mark.parametrize("task", ["window-open", "window-close"])
+def test_base_capsules_follow_the_mesh(near_states, task):
+    """The mesh is replaced by capsules: within 2 mm where a window handle meets it."""
+    env, states = near_states[task]
+    model, mesh = env.env.model, None
+    body = model.body("right_hand").id
+    for geom in range(model.ngeom):
+        if model.geom_bodyid[geom] == body and model.geom_contype[geom]:
+            mesh = geom
+    contacts = ours(task, states, base_capsule_contacts)
+    dist = np.asarray(contacts.dist).reshape(len(states), -1, 3).min(1)
+    errors = []
+    for i, (data, _) in enumerate(states):
+        for k, handle in enumerate(handle_capsules(task, model)):
+            expected = mujoco.mj_geomDistance(model, data, mesh, handle, 0.02, np.zeros(6))
+            if -0.002 < expected < 0.005:
+                errors.append(dist[i, k] - expected)
+    assert len(errors) > 20
+    assert np.abs(np.median(errors)) < 1e-3 and np.abs(errors).max() < 3e-3
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_boxes_are_met_where_they_are(near_states, task):
+    """Every sphere's distance is that of the nearest box of the scene, wherever it has moved."""
+    env, states = near_states[task]
+    model = env.env.model
+    gripper = load_gripper(load_scene(SCENE[task]))
+    contacts = ours(task, states, sphere_box_contacts)
+    boxes = [
+        g
+        for g in range(model.ngeom)
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX
+        and (model.geom_contype[g] | model.geom_conaffinity[g])
+        and model.geom(g).name not in FINGERS
+    ]
+    checked = 0
+    for i, (data, _) in enumerate(states[::4]):
+        link = data.body("right_l6")
+        slide = np.array([0.0, *data.qpos[RIGHT_FINGER : LEFT_FINGER + 1]])[gripper.sphere_part]
+        axis = np.concatenate([np.zeros((1, 3)), gripper.finger_axis])[gripper.sphere_part]
+        center = gripper.sphere_center + axis * slide[:, None]
+        center = link.xpos + center @ link.xmat.reshape(3, 3).T
+        outside = [
+            np.linalg.norm(np.maximum(np.abs(local) - model.geom_size[g], 0), axis=1)
+            for g in boxes
+            for local in [(center - data.geom_xpos[g]) @ data.geom_xmat[g].reshape(3, 3)]
+        ]
+        expected = np.min(outside, 0) - gripper.sphere_radius
+        apart = expected > 1e-4 - gripper.sphere_radius  # centres outside all boxes
+        near = apart & (expected < 0.1)  # the three walls left out are farther than that
+        checked += near.sum()
+        np.testing.assert_allclose(contacts.dist[4 * i][near], expected[near], atol=5e-6)
+    assert checked > 50
+
+
+def test_mixed_parameters_equal_mujocos(near_states):
+    seen = set()
+    for task in TASKS:
+        env, states = near_states[task]
+        model = env.env.model
+        for data, _ in states:
+            for contact in data.contact:
+                pair = (int(contact.geom1), int(contact.geom2))
+                if contact.efc_address < 0 or (task, pair) in seen:
+                    continue
+                seen.add((task, pair))
+                sides = [
+                    Material(
+                        friction=model.geom_friction[g, :2],
+                        solref=model.geom_solref[g],
+                        solimp=model.geom_solimp[g],
+                        margin=model.geom_margin[g],
+                        invweight=model.body_invweight0[model.geom_bodyid[g], 0],
+                    )
+                    for g in pair
+                ]
+                mixed = mix(*sides)
+                np.testing.assert_allclose(mixed.friction, contact.friction[[0, 2]], rtol=1e-6)
+                np.testing.assert_allclose(mixed.solref, contact.solref, rtol=1e-6)
+                np.testing.assert_allclose(mixed.solimp, contact.solimp, rtol=1e-6)
+                np.testing.assert_allclose(mixed.margin, contact.includemargin, rtol=1e-6)
+    assert len(seen) >= 6
+
+
+def test_goals_lie_where_the_shapes_are_placed():
+    """A placement moves the handle of our shapes as it moves Meta-World's."""
+    for i, task in enumerate(TASKS):
+        env = ReferenceEnv(task)
+        env.reset(GOALS[i, 0])
+        model, data = env.env.model, env.env.data
+        mujoco.mj_forward(model, data)
+        scene = load_scene(SCENE[task])
+        shapes, fixture = load_shapes(SCENE[task], scene), load_fixture(SCENE[task], scene)
+        moved = shapes.capsule_ends.mean(1) + GOALS[i, 0] + fixture.axis * data.qpos[SLIDE]
+        np.testing.assert_allclose(moved, data.geom_xpos[handle_capsules(task, model)], atol=1e-9)
