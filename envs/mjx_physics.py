@@ -31,7 +31,9 @@ from envs.model import (
     load_fixture,
     load_scene,
 )
+from envs.physics import FRAME_SKIP, Positions, settled_starts
 from envs.solver import Rows, make_rows, solve
+from envs.tasks import ACTION_SCALE, HAND_HIGH, HAND_LOW
 
 with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp is not installed
     from mujoco import mjx
@@ -39,7 +41,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp is not i
     from mujoco.mjx._src import math as mjx_math
     from mujoco.mjx._src import smooth as mjx_smooth
 
-SUBSTEPS = 5
+SUBSTEPS = FRAME_SKIP
 SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6
 LIMIT_SOLREF, LIMIT_SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)  # MuJoCo defaults
 WELD_TORQUE_SCALE = 5.0  # SawyerMocapBase.reset_mocap_welds
@@ -53,17 +55,6 @@ class PhysicsState(struct.PyTreeNode):
     warm_start: jax.Array  # (10,) last joint acceleration
     mocap: jax.Array  # (3,) commanded hand position, metres
     placement: jax.Array  # (3,) the fixture's position, metres
-
-
-class Positions(struct.PyTreeNode):
-    """What observation and reward read from a physics state, metres in the world."""
-
-    hand: jax.Array  # (3,) body `hand`
-    right_tip: jax.Array  # (3,) site rightEndEffector
-    left_tip: jax.Array  # (3,)
-    finger_gap: jax.Array  # () distance of the claw bodies
-    fixture: jax.Array  # (3,) the fixture's moving body
-    slide: jax.Array  # () fixture slide position
 
 
 class SceneData(NamedTuple):
@@ -86,6 +77,10 @@ class MjxPhysics:
         scenes = [SceneData(load_fixture(s, m), load_shapes(s, m)) for s, m in full.items()]
         self.scenes: SceneData = jax.tree.map(lambda *x: _float32(np.stack(x)), *scenes)
         self._read_constants(drawer)
+        starts = settled_starts()
+        self._start_qpos, self._start_qvel, self._start_warm, self._start_mocap = (
+            _float32(leaf) for leaf in (starts.qpos, starts.qvel, starts.warm_start, starts.mocap)
+        )
 
     def _read_constants(self, model: Any) -> None:
         import mujoco
@@ -110,6 +105,34 @@ class MjxPhysics:
     def scene(self, scene_id: jax.Array) -> SceneData:
         """The numbers of one scene, by index into `SCENES`."""
         return jax.tree.map(lambda leaf: leaf[scene_id], self.scenes)
+
+    def fixture(self, scene_id: jax.Array) -> Fixture:
+        """The fixture's numbers of one scene."""
+        return self.scene(scene_id).fixture
+
+    def start(self, task_id: jax.Array, placement: jax.Array) -> PhysicsState:
+        """The settled state of a task with the fixture at `placement` (3,)."""
+        return PhysicsState(
+            qpos=self._start_qpos[task_id],
+            qvel=self._start_qvel[task_id],
+            warm_start=self._start_warm[task_id],
+            mocap=self._start_mocap[task_id],
+            placement=jnp.asarray(placement, jnp.float32),
+        )
+
+    def advance(
+        self, state: PhysicsState, action: jax.Array, scene_id: jax.Array
+    ) -> tuple[PhysicsState, jax.Array]:
+        """Moves the mocap target by an action (4,) in [-1, 1] and simulates one control step.
+
+        Returns:
+            The new state and whether it is finite, () bool.
+        """
+        mocap = state.mocap + action[:3] * ACTION_SCALE
+        mocap = jnp.clip(mocap, jnp.array(HAND_LOW), jnp.array(HAND_HIGH))
+        ctrl = jnp.stack([action[3], -action[3]])
+        state = self.step(state.replace(mocap=mocap), ctrl, scene_id)
+        return state, jnp.isfinite(state.qpos).all() & jnp.isfinite(state.qvel).all()
 
     def step(self, state: PhysicsState, ctrl: jax.Array, scene_id: jax.Array) -> PhysicsState:
         """One control step (five substeps of 2.5 ms) with the mocap target already moved.

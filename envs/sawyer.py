@@ -8,34 +8,31 @@ can fill in.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
 
 from envs import rewards
-from envs.mjx_physics import MjxPhysics, PhysicsState, Positions
-from envs.model import SLIDE, load_scene
+from envs.physics import Physics, Positions, make_physics, settled_starts
 from envs.tasks import (
-    ACTION_SCALE,
     HAND_HIGH,
     HAND_LOW,
     OBS_HAND_HIGH,
     OBS_HAND_LOW,
     SCENE_ID,
     SPECS,
-    Task,
 )
 
 OBS_SIZE, ACTION_SIZE, FRAME = 39, 4, 18
-SETTLE_STEPS, FRAME_SKIP = 50, 5  # SawyerXYZEnv._reset_hand
 
 
 class State(struct.PyTreeNode):
     """One lane's environment state."""
 
-    physics: PhysicsState
+    physics: Any  # of the backend, with `placement` (3,)
     task_id: jax.Array  # () int32, index into `tasks.TASKS`
     frame: jax.Array  # (18,) last frame, the second half of the next observation
     obs: jax.Array  # (39,) frame, previous frame, goal (zeros when hidden)
@@ -47,13 +44,12 @@ class State(struct.PyTreeNode):
 
 
 class _TaskData:
-    """`SPECS` as arrays with a leading task axis, and each task's settled start state."""
+    """`SPECS` as arrays with a leading task axis, and what each task shows at its start."""
 
     def __init__(self) -> None:
         column = lambda field: jnp.asarray(
             np.array([getattr(spec, field) for spec in SPECS], np.float32)
         )
-        self.hand_start = column("hand_start")
         self.placement_low = column("placement_low")
         self.placement_high = column("placement_high")
         self.start_slide = column("start_slide")
@@ -61,38 +57,11 @@ class _TaskData:
         self.handle = column("handle")
         self.has_quaternion = column("has_quaternion")
         self.target = column("target")
-        starts = [settle(spec) for spec in SPECS]
-        self.qpos, self.qvel, self.warm_start, self.hand, self.opening, self.init_tcp = (
-            jnp.asarray(np.stack(leaves), jnp.float32) for leaves in zip(*starts, strict=True)
+        starts = settled_starts()
+        self.hand, self.opening, self.init_tcp = (
+            jnp.asarray(leaf, jnp.float32)
+            for leaf in (starts.hand, starts.opening, starts.init_tcp)
         )
-
-
-def settle(spec: Task):
-    """The start of every episode of a task, by MuJoCo C in float64.
-
-    Meta-World pulls the hand from the zero pose to its start for 50 x 5 substeps at every reset;
-    the outcome does not depend on the goal, so it is computed once. What Meta-World then shows and
-    remembers is one substep behind the state, unless the task runs a forward pass (drawer-close).
-
-    Returns:
-        qpos (10,), qvel (10,), warm start (10,), hand (3,) and gripper opening () as observed
-        after a reset, and the finger-tip midpoint (3,) that the reward refers to.
-    """
-    model = load_scene(spec.scene)
-    data = mujoco.MjData(model)
-    for _ in range(SETTLE_STEPS):
-        data.mocap_pos[0] = spec.hand_start
-        data.mocap_quat[0] = [1, 0, 1, 0]
-        data.ctrl[:] = [-1, 1]
-        mujoco.mj_step(model, data, nstep=FRAME_SKIP)
-    tips = [data.site(name).xpos for name in ("rightEndEffector", "leftEndEffector")]
-    init_tcp = np.mean(tips, 0)
-    qpos, qvel, warm_start = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
-    if spec.forward_at_reset:
-        mujoco.mj_forward(model, data)
-    gap = np.linalg.norm(data.body("rightclaw").xpos - data.body("leftclaw").xpos)
-    opening = np.clip(gap / 0.1, 0.0, 1.0)
-    return qpos, qvel, warm_start, data.body("hand").xpos.copy(), opening, init_tcp
 
 
 class Ml4Env:
@@ -100,13 +69,17 @@ class Ml4Env:
 
     Args:
         goal_observable: show the target in the last three observation numbers.
+        physics: backend, one of `physics.BACKENDS`.
+
+    Raises:
+        ValueError: unknown backend.
     """
 
     observation_size = OBS_SIZE
     action_size = ACTION_SIZE
 
-    def __init__(self, goal_observable: bool = False):
-        self.physics = MjxPhysics()
+    def __init__(self, goal_observable: bool = False, physics: str = "mjx"):
+        self.physics: Physics = make_physics(physics)
         self.goal_observable = goal_observable
         self.tasks = _TaskData()
         self._scene_id = jnp.asarray(SCENE_ID)
@@ -120,8 +93,8 @@ class Ml4Env:
         """A fresh episode with the fixture at `placement` (3,), a goal of a named goal set."""
         tasks = self.tasks
         task_id = jnp.asarray(task_id, jnp.int32)
-        physics = self._start(task_id, placement)
-        fixture = self.physics.scene(self._scene_id[task_id]).fixture
+        physics = self.physics.start(task_id, placement)
+        fixture = self.physics.fixture(self._scene_id[task_id])
         shown = physics.placement + fixture.offset + fixture.axis * tasks.first_obs_slide[task_id]
         frame = self._frame(tasks.hand[task_id], tasks.opening[task_id], shown, task_id)
         goal = self._target(physics, task_id) * float(self.goal_observable)
@@ -141,21 +114,15 @@ class Ml4Env:
     def step(self, state: State, action: jax.Array) -> State:
         """One control step; `action` (4,) in [-1, 1]: hand displacement / 0.01 m, finger effort."""
         action = jnp.clip(action, -1.0, 1.0)
-        mocap = state.physics.mocap + action[:3] * ACTION_SCALE
-        mocap = jnp.clip(mocap, jnp.array(HAND_LOW), jnp.array(HAND_HIGH))
-        ctrl = jnp.stack([action[3], -action[3]])
         scene = self._scene_id[state.task_id]
-        physics = self.physics.step(state.physics.replace(mocap=mocap), ctrl, scene)
-        is_finite = jnp.isfinite(physics.qpos).all() & jnp.isfinite(physics.qvel).all()
-        start = self._start(state.task_id, physics.placement)
+        physics, is_finite = self.physics.advance(state.physics, action, scene)
+        start = self.physics.start(state.task_id, physics.placement)
         physics = jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), physics, start)
         state = state.replace(faults=state.faults + 1 - is_finite.astype(jnp.int32))
         positions = self.physics.positions(physics, scene)
         return self.observe(state, physics, positions, action)
 
-    def observe(
-        self, state: State, physics: PhysicsState, positions: Positions, action: jax.Array
-    ) -> State:
+    def observe(self, state: State, physics: Any, positions: Positions, action: jax.Array) -> State:
         """The state after a control step, from the new physics state and its positions."""
         task_id = state.task_id
         opening = jnp.clip(positions.finger_gap / 0.1, 0.0, 1.0)
@@ -166,8 +133,8 @@ class Ml4Env:
                 self._target(physics, task_id), jnp.array(HAND_LOW), jnp.array(HAND_HIGH)
             )
         obs = jnp.concatenate([_clip_hand(frame), _clip_hand(state.frame), goal])
-        scene = self.physics.scene(self._scene_id[task_id])
-        start = physics.placement + scene.fixture.offset + self.tasks.handle[task_id]
+        fixture = self.physics.fixture(self._scene_id[task_id])
+        start = physics.placement + fixture.offset + self.tasks.handle[task_id]
         inputs = rewards.RewardInputs(
             hand=obs[:3],
             tcp=0.5 * (positions.right_tip + positions.left_tip),
@@ -175,7 +142,7 @@ class Ml4Env:
             slide=positions.slide,
             gripper_effort=action[3],
             init_tcp=self.tasks.init_tcp[task_id],
-            init_handle=start + scene.fixture.axis * self.tasks.start_slide[task_id],
+            init_handle=start + fixture.axis * self.tasks.start_slide[task_id],
         )
         values = [reward(inputs) for reward in rewards.REWARDS]
         pick = lambda i: jnp.stack([value[i] for value in values])[task_id]
@@ -189,18 +156,7 @@ class Ml4Env:
             steps=state.steps + 1,
         )
 
-    def _start(self, task_id: jax.Array, placement: jax.Array) -> PhysicsState:
-        """The settled physics state with the fixture at `placement` (3,)."""
-        tasks = self.tasks
-        return PhysicsState(
-            qpos=tasks.qpos[task_id].at[SLIDE].set(tasks.start_slide[task_id]),
-            qvel=tasks.qvel[task_id],
-            warm_start=tasks.warm_start[task_id],
-            mocap=tasks.hand_start[task_id],
-            placement=jnp.asarray(placement, jnp.float32),
-        )
-
-    def _target(self, physics: PhysicsState, task_id: jax.Array) -> jax.Array:
+    def _target(self, physics: Any, task_id: jax.Array) -> jax.Array:
         return physics.placement + self.tasks.target[task_id]
 
     def _frame(
