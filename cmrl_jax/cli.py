@@ -32,7 +32,7 @@ from cmrl_jax.validate import check_goal_set
 COMMANDS = ("train", "eval", "plot", "bench")
 # Commands and options of the design whose code is not there yet: refused by name.
 NOT_BUILT = ("sweep", "finetune", "render", "goals")
-EVAL_NOT_BUILT = {"z": ("prior", "shuffled", "other", "text"), "physics": ("native", "metaworld")}
+EVAL_NOT_BUILT = {"z": ("prior", "shuffled", "other", "text"), "physics": ("metaworld",)}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -190,10 +190,9 @@ def eval_parser() -> argparse.ArgumentParser:
     add("--checkpoint", type=_natural, metavar="N", help="iteration of the checkpoint [the last]")
     add(
         "--physics",
-        default="mjx",
         metavar="P",
-        choices=("mjx", *EVAL_NOT_BUILT["physics"]),
-        help="mjx; native and metaworld are not built yet [mjx]",
+        choices=("mjx", "native", *EVAL_NOT_BUILT["physics"]),
+        help="mjx, native; metaworld is not built yet [env.physics of the run]",
     )
     add(
         "--z",
@@ -237,6 +236,7 @@ def _eval(words: list[str]) -> int:
         goal_set=args.goal_set,
         seed=args.seed,
         horizon=args.horizon,
+        physics=args.physics,
         checkpoint=args.checkpoint,
         json_path=args.json,
     )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
@@ -22,6 +24,7 @@ def evaluate_run(
     goal_set: str,
     seed: int,
     horizon: int | None,
+    physics: Literal["mjx", "native"] | None,
     checkpoint: int | None,
     json_path: Path | None,
 ) -> int:
@@ -31,12 +34,17 @@ def evaluate_run(
         k: adaptation episodes.
         goals: goals a task, the first of the set.
         horizon: control steps an episode; None for the run's own.
+        physics: backend to evaluate in; None for the one the run was trained in.
         checkpoint: iteration; None for the newest.
 
     Raises:
         ConfigError: no such checkpoint, or it does not fit this program.
     """
     config = resolve(*read_yaml(run / "config.yaml"))
+    if physics is not None:
+        # A policy does not know its simulator. impl belongs to mjx, and its default serves both.
+        impl = config.env.impl if physics == config.env.physics else "jax"
+        config = replace(config, env=replace(config.env, physics=physics, impl=impl))
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
     state = jax.eval_shape(session.learner.init, jax.random.key(0))
@@ -55,13 +63,14 @@ def evaluate_run(
     scores = evaluator.run(policy["params"], session.placements(goal_set, goals), k, seed)
     summary = summarise(scores, session.eval_tasks)
     where = f"{goals} goals of '{goal_set}', horizon {evaluator.horizon}, seed {seed}"
-    print(f"checkpoint {meta['iteration']} of {run}: {where}")
+    print(f"checkpoint {meta['iteration']} of {run}: {where}, {config.env.physics}")
     print(format_scores(summary))
     if json_path is not None:
         result = {
             "tasks": summary,
             "goals": goals,
             "goal_set": goal_set,
+            "physics": config.env.physics,
             "horizon": evaluator.horizon,
             "iteration": meta["iteration"],
             "env_steps": meta["env_steps"],

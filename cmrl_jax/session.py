@@ -46,7 +46,7 @@ class Session:
         self.config = config
         self.eval_tasks = config.tasks.train + config.tasks.test
         self.goals: GoalTable = load_goals(config.goals.table, self.eval_tasks)
-        self.env = call_envs(lambda: Ml4Env(config.env.goal_observable))
+        self.env = call_envs(lambda: Ml4Env(config.env.goal_observable, config.env.physics))
         self.train_goals = jnp.asarray(self.goals.select(config.tasks.train).vectors)
         self.learner: Learner = make_learner(config, self.train_goals)
 

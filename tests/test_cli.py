@@ -190,16 +190,16 @@ def test_other_exceptions_keep_their_traceback(calls, monkeypatch):
 def test_eval_hands_over_its_flags(calls, here):
     make_run(here / "r")
     words = ["--k", "0,1,5", "--goals", "4", "--goal-set", "fresh:7", "--seed", "3"]
-    words += ["--horizon", "500", "--checkpoint", "12", "--z", "posterior", "--json", "out/f.json"]
+    words += ["--horizon", "500", "--checkpoint", "12", "--physics", "native", "--json", "out/f.json"]
     assert main(["eval", "--run", "r", *words]) == 0
     assert main(["eval", "--run", "r"]) == 0
     assert calls[0][2] == {
         "run": Path("r"), "k": (0, 1, 5), "goals": 4, "goal_set": "fresh:7", "seed": 3,
-        "horizon": 500, "checkpoint": 12, "json_path": Path("out/f.json"),
+        "horizon": 500, "physics": "native", "checkpoint": 12, "json_path": Path("out/f.json"),
     }  # fmt: skip
     assert calls[1][2] == {
         "run": Path("r"), "k": (0, 1, 2), "goals": 50, "goal_set": "heldout", "seed": 0,
-        "horizon": None, "checkpoint": None, "json_path": None,
+        "horizon": None, "physics": None, "checkpoint": None, "json_path": None,
     }  # fmt: skip
     assert list((here / "out").iterdir()) == []  # tried, and left to the command to write
 
