@@ -45,9 +45,16 @@ def _take(material: Material, index: jax.Array) -> Material:
 
 
 def _deepest(contacts: Contacts, count: int) -> Contacts:
-    """The `count` contacts with the smallest distance beyond their margin."""
-    _, index = jax.lax.top_k(contacts.material.margin - contacts.dist, count)
-    return jax.tree.map(lambda leaf: leaf[index], contacts)
+    """The `count` contacts deepest beyond their margin; they carry the load of the others.
+
+    With n points in contact and fewer kept, each kept one is as stiff as n / count of them:
+    otherwise a hard push sinks in deeper than the handle is thick, and passes through.
+    """
+    depth = contacts.material.margin - contacts.dist
+    share = jnp.maximum(jnp.sum(depth > 0) / count, 1.0)
+    _, index = jax.lax.top_k(depth, count)
+    kept = jax.tree.map(lambda leaf: leaf[index], contacts)
+    return kept._replace(material=kept.material._replace(invweight=kept.material.invweight / share))
 
 
 def point_box(point: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -59,6 +66,28 @@ def point_box(point: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
     is_outside = jnp.any(depth > 0, -1, keepdims=True)
     dist = jnp.where(is_outside, norm, depth.max(-1, keepdims=True))[..., 0]
     return dist, jnp.where(is_outside, outside / norm, face)
+
+
+def stem_box(stem: jax.Array, point: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`point_box` for the end of a stick from `stem` to `point` (..., 3) that may pierce the box.
+
+    A stick that came through a thin plate is pushed back the way it came, not out at the far side:
+    where the stick crosses the box, faces turned away from the stem are no way out.
+    """
+    dist, normal = point_box(point, half)
+    along = point - stem
+    along = jnp.where(jnp.abs(along) < _EPS, _EPS, along)
+    one, two = (-half - stem) / along, (half - stem) / along
+    enter, leave = jnp.minimum(one, two).max(-1), jnp.maximum(one, two).min(-1)
+    crosses = (enter < leave) & (enter < 1.0) & (leave > 0.0)
+    # Depth below the six faces, those at +half first.
+    depth = jnp.concatenate([half - point, half + point], -1)
+    away = jnp.concatenate([stem < -half, stem > half], -1)
+    depth = jnp.where(away, jnp.inf, depth)
+    least = depth.min(-1)
+    faces = (depth == least[..., None]).astype(point.dtype)
+    out = faces[..., :3] - faces[..., 3:]
+    return jnp.where(crosses, -least, dist), jnp.where(crosses[..., None], out, normal)
 
 
 def _segment_box(start: jax.Array, end: jax.Array, half: jax.Array):
@@ -179,27 +208,29 @@ def sphere_box_contacts(
     """Each gripper sphere (23) against the box it is deepest in: case, panels, frame, table."""
     slide = jnp.concatenate([jnp.zeros(1), finger_slide])[gripper.sphere_part]
     axis = jnp.concatenate([jnp.zeros((1, 3)), gripper.finger_axis])[gripper.sphere_part]
-    center = link_pos + (gripper.sphere_center + axis * slide[:, None]) @ link_rot.T  # (23, 3)
+    moved = axis * slide[:, None]
+    center = link_pos + (gripper.sphere_center + moved) @ link_rot.T  # (23, 3)
+    stem = link_pos + (gripper.sphere_stem + moved) @ link_rot.T
     placed = jnp.asarray(shapes.box_placed)[:, None]
     moves = jnp.asarray(shapes.box_moves)[:, None]
     box = shapes.box_center + placed * placement + moves * (handle_shift - placement)  # (BOXES, 3)
-    local = center[:, None] - box[None]
-    dist, _ = point_box(local, jnp.asarray(shapes.box_half)[None])  # (23, BOXES)
+    half = jnp.asarray(shapes.box_half)
+    dist, _ = stem_box(stem[:, None] - box, center[:, None] - box, half)  # (23, BOXES)
     nearest = jnp.argmin(dist, 1)
-    local = jnp.take_along_axis(local, nearest[:, None, None], 1)[:, 0]
-    dist, normal = point_box(local, jnp.asarray(shapes.box_half)[nearest])
+    dist, normal = stem_box(stem - box[nearest], center - box[nearest], half[nearest])
     dist = dist - gripper.sphere_radius
     radius = jnp.asarray(gripper.sphere_radius)[:, None]
+    material = mix(
+        Material(*(jnp.asarray(x) for x in gripper.sphere_material)),
+        _take(shapes.box_material, nearest),
+    )
     return Contacts(
         dist=dist,
         pos=center - normal * (radius + 0.5 * dist[:, None]),
         normal=-normal,
         part=jnp.asarray(gripper.sphere_part),
         moves=jnp.asarray(shapes.box_moves)[nearest],
-        material=mix(
-            Material(*(jnp.asarray(x) for x in gripper.sphere_material)),
-            _take(shapes.box_material, nearest),
-        ),
+        material=material._replace(invweight=material.invweight / gripper.sphere_count),
     )
 
 

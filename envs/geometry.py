@@ -33,6 +33,9 @@ _BASE_CAPSULES = (
 # Spheres on a finger pad (metres, frame of the pad): tip and middle, both edges.
 _PAD_SPHERES = ((0.042, -0.012), (0.042, 0.012), (-0.010, -0.012), (-0.010, 0.012))
 _PAD_SPHERE_RADIUS = 0.003
+_PAD_ROOT = -0.045  # where a finger leaves the hand
+# A finger end or side on a box makes eight contacts in MuJoCo, claw and pad four each.
+_FINGER_COUNT, _BASE_COUNT = 4.0, 2.0
 
 
 class Material(NamedTuple):
@@ -57,7 +60,9 @@ class Gripper(NamedTuple):
     base_material: Material
     sphere_center: np.ndarray  # (23, 3)
     sphere_radius: np.ndarray  # (23,)
+    sphere_stem: np.ndarray  # (23, 3) a point of the same part well inside the gripper
     sphere_part: np.ndarray  # (23,)
+    sphere_count: np.ndarray  # (23,) MuJoCo's contact points that one of ours stands for
     sphere_material: Material
     hand_rotation: np.ndarray  # (3, 3) axes of body `hand` (and of the finger boxes)
     finger_axis: np.ndarray  # (2, 3) slide directions of right and left finger
@@ -125,9 +130,11 @@ def load_gripper(model: mujoco.MjModel) -> Gripper:
         side: on_body(f"{side}pad", np.array([(x, 0.0, z) for x, z in _PAD_SPHERES]))
         for side in ("right", "left")
     }
+    roots = [on_body(f"{side}pad", np.array([(_PAD_ROOT, 0.0, 0.0)])) for side in ("right", "left")]
     material = _material(model, [*mesh, *fingers])  # 0: base; 1..4: finger boxes
-    # Spheres stand for the finger as a whole: geometry of the pad, material of the smoother claw.
-    sphere_index = [1] * 4 + [3] * 4 + [0] * len(base_spheres)
+    # A finger is a claw and a pad, nearly at one place: half of its spheres have either's material,
+    # crosswise, so that neither edge of a finger is the rougher one.
+    sphere_index = [1, 2, 2, 1, 4, 3, 3, 4] + [0] * len(base_spheres)
     rotation = link_rot.T @ data.body("hand").xmat.reshape(3, 3)
     axes = [link_rot.T @ data.xaxis[model.joint(name).id] for name in ("r_close", "l_close")]
     return Gripper(
@@ -140,7 +147,14 @@ def load_gripper(model: mujoco.MjModel) -> Gripper:
         base_material=_repeat(material, [0] * len(base_radius)),
         sphere_center=np.concatenate([pads["right"], pads["left"], base_spheres]),
         sphere_radius=np.concatenate([np.full(8, _PAD_SPHERE_RADIUS), np.repeat(base_radius, 3)]),
+        sphere_stem=np.concatenate(
+            [
+                *(np.repeat(root, 4, 0) for root in roots),
+                np.tile(base_spheres.mean(0), (len(base_spheres), 1)),
+            ]
+        ),
         sphere_part=np.array([RIGHT] * 4 + [LEFT] * 4 + [HAND] * len(base_spheres)),
+        sphere_count=np.array([_FINGER_COUNT] * 8 + [_BASE_COUNT] * len(base_spheres)),
         sphere_material=_repeat(material, sphere_index),
         hand_rotation=rotation,
         finger_axis=np.array(axes),

@@ -60,10 +60,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _check(args: argparse.Namespace) -> None:
     """Raises ValueError (cause, cure) for what the parser cannot see."""
-    if args.physics == "native":
-        raise ValueError("the physics backend 'native' is not built yet\nuse --physics mjx")
-    if args.physics != "mjx":
-        raise ValueError(f"unknown physics backend '{args.physics}'\nuse --physics mjx")
+    if args.physics not in ("mjx", "native"):
+        raise ValueError(f"unknown physics backend '{args.physics}'\nuse --physics mjx or native")
     if not 1 <= args.goals <= GOALS:
         raise ValueError(f"a goal set holds {GOALS} goals a task, --goals {args.goals} is none\n"
                          f"use 1 to {GOALS}")  # fmt: skip
@@ -81,6 +79,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def measure(
+    physics: str,
     goal_set: str,
     goals: int,
     horizon: int,
@@ -91,6 +90,7 @@ def measure(
     """Measures the port.
 
     Args:
+        physics: backend, `mjx` or `native`.
         goal_set: see `goal_sets.load_goal_set`.
         goals: goals a task, the first of the set.
         horizon: control steps an episode.
@@ -113,7 +113,7 @@ def measure(
     from envs import parity_parts as parts
     from envs.tasks import TASKS
 
-    port = parts.Port(lanes=places.shape[0] * goals)
+    port = parts.Port(places.shape[0] * goals, physics)
     tasks: dict[str, dict[str, Any]] = {task: {} for task in TASKS}
 
     def add(results: list[dict[str, Any]]) -> None:
@@ -134,7 +134,7 @@ def measure(
     names = ("jax", "mujoco", "mujoco-mjx", "metaworld")
     return {
         "tasks": tasks,
-        "physics": "mjx",
+        "physics": physics,
         "goals": goals,
         "goal_set": goal_set,
         "seed": seed,
@@ -152,7 +152,8 @@ def _run(words: Sequence[str]) -> None:
     if not args.policies:
         noises.append(DEFAULT_NOISE if noises[0] == 0 else 0.0)
     start = time.perf_counter()
-    result = measure(goal_set, args.goals, args.horizon, noises, args.seed or 0, not args.policies)
+    seed, all_parts = args.seed or 0, not args.policies
+    result = measure(args.physics, goal_set, args.goals, args.horizon, noises, seed, all_parts)
     result["seconds"] = round(time.perf_counter() - start, 1)
     from envs.parity_report import report, to_json
 

@@ -13,8 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.mjx_physics import PhysicsState, Positions
+from envs.mjx_physics import PhysicsState
 from envs.model import FIXTURE_BODY, LEFT_FINGER, RIGHT_FINGER, SLIDE
+from envs.native import NativePhysics, unpack
+from envs.physics import Positions
 from envs.reference import ReferenceEnv, Rollout, record_rollout, scripted_policy
 from envs.sawyer import OBS_SIZE, Ml4Env, State
 from envs.tasks import SCENE_ID, SPECS, TASKS
@@ -37,10 +39,11 @@ class Port:
 
     Args:
         lanes: batch size of the one compiled step; longer batches go through it in pieces.
+        physics: backend, one of `physics.BACKENDS`.
     """
 
-    def __init__(self, lanes: int):
-        env = Ml4Env()
+    def __init__(self, lanes: int, physics: str = "mjx"):
+        env = Ml4Env(physics=physics)
         scene_id = jnp.asarray(SCENE_ID)
         self.lanes = lanes
         self.reset = jax.jit(jax.vmap(env.reset_to))
@@ -56,6 +59,46 @@ class Port:
             jax.vmap(lambda state, positions, a: env.observe(state, state.physics, positions, a))
         )
 
+    def states(self, rollout: Rollout, rows: np.ndarray, frames: np.ndarray) -> State:
+        """Recorded states of Meta-World in our form, numpy leaves with a leading row axis.
+
+        Args:
+            rows: which states of the rollout.
+            frames: (row, 18) what the next observation shows as the previous frame.
+        """
+        count, task = len(rows), TASKS.index(rollout.task)
+        exact = (
+            rollout.qpos[rows],
+            rollout.qvel[rows],
+            rollout.warmstart[rows],
+            rollout.mocap_pos[rows],
+            np.tile(rollout.rand_vec, (count, 1)),
+        )
+        physics: Any = PhysicsState(*(np.asarray(x, np.float32) for x in exact))  # type: ignore
+        if isinstance(self.env.physics, NativePhysics):
+            physics = self.env.physics.host_state(np.full(count, SCENE_ID[task]), *exact)
+
+        def zeros(dtype: Any, *tail: int) -> Any:
+            return np.zeros((count, *tail), dtype)
+
+        return State(
+            physics=physics,
+            task_id=zeros(np.int32) + np.int32(task),
+            frame=zeros(np.float32, 18) + np.asarray(frames, np.float32),
+            obs=zeros(np.float32, OBS_SIZE),
+            reward=zeros(np.float32),
+            success=zeros(bool),
+            distance=zeros(np.float32),
+            steps=zeros(np.int32),
+            faults=zeros(np.int32),
+        )
+
+    def qpos(self, state: State) -> np.ndarray:
+        """Joint positions (lane, 10) of states, float64."""
+        if isinstance(self.env.physics, NativePhysics):
+            return unpack(state.physics)["qpos"]
+        return np.asarray(state.physics.qpos, np.float64)
+
     def in_pieces(self, function: Callable[..., State], *trees: Any) -> State:
         """`function` over trees with any number of rows; the result is on the host."""
         rows = jax.tree.leaves(trees)[0].shape[0]
@@ -65,41 +108,6 @@ class Port:
             result = function(*jax.tree.map(lambda leaf: leaf[piece], trees))
             pieces.append(jax.tree.map(np.asarray, result))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:rows], *pieces)
-
-
-def port_states(rollout: Rollout, rows: np.ndarray, frames: np.ndarray) -> State:
-    """Recorded states of Meta-World in our form, numpy leaves with a leading row axis.
-
-    Args:
-        rows: which states of the rollout.
-        frames: (row, 18) what the next observation shows as the previous frame.
-    """
-    count = len(rows)
-
-    def float32(array: np.ndarray) -> Any:
-        return np.asarray(array, np.float32)
-
-    def zeros(dtype: Any, *tail: int) -> Any:
-        return np.zeros((count, *tail), dtype)
-
-    physics = PhysicsState(
-        qpos=float32(rollout.qpos[rows]),
-        qvel=float32(rollout.qvel[rows]),
-        warm_start=float32(rollout.warmstart[rows]),
-        mocap=float32(rollout.mocap_pos[rows]),
-        placement=float32(np.tile(rollout.rand_vec, (count, 1))),
-    )
-    return State(
-        physics=physics,
-        task_id=zeros(np.int32) + np.int32(TASKS.index(rollout.task)),
-        frame=float32(frames),
-        obs=zeros(np.float32, OBS_SIZE),
-        reward=zeros(np.float32),
-        success=zeros(bool),
-        distance=zeros(np.float32),
-        steps=zeros(np.int32),
-        faults=zeros(np.int32),
-    )
 
 
 def record(goals: np.ndarray, steps: int, seed: int) -> list[Rollout]:
@@ -112,10 +120,12 @@ def record(goals: np.ndarray, steps: int, seed: int) -> list[Rollout]:
     ]
 
 
-def part_errors(ours: State, qpos: np.ndarray, hand: np.ndarray) -> dict[str, np.ndarray]:
+def part_errors(
+    port: Port, ours: State, qpos: np.ndarray, hand: np.ndarray
+) -> dict[str, np.ndarray]:
     """Errors (row,) in metres of our states against joint and hand positions of Meta-World."""
     fingers = slice(RIGHT_FINGER, LEFT_FINGER + 1)
-    error = np.abs(np.asarray(ours.physics.qpos, np.float64) - qpos)
+    error = np.abs(port.qpos(ours) - qpos)
     return {
         "hand": np.linalg.norm(np.asarray(ours.frame, np.float64)[:, :3] - hand, axis=-1),
         "fingers": error[:, fingers].max(-1),
@@ -147,8 +157,8 @@ def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, 
     reward, success, distance, obs, qpos, hand = [], [], [], [], [], []
     for rollout in rollouts:
         rows = np.arange(1, len(rollout.action), ROW_STRIDE)
-        states.append(port_states(rollout, rows, rollout.prev_frame[rows]))
-        before.append(port_states(rollout, rows, rollout.prev_frame[rows + 1]))
+        states.append(port.states(rollout, rows, rollout.prev_frame[rows]))
+        before.append(port.states(rollout, rows, rollout.prev_frame[rows + 1]))
         actions.append(rollout.action[rows - 1])
         onward.append(rollout.action[rows])
         qpos.append(rollout.qpos[rows + 1])
@@ -171,7 +181,7 @@ def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, 
     near = np.abs(np.array(distance) - SUCCESS_DISTANCE[task]) <= THRESHOLD_BAND
     wrong = ours.success != np.array(success)
     stepped = port.in_pieces(port.step, stack(before), np.concatenate(onward))
-    errors = part_errors(stepped, np.concatenate(qpos), np.array(hand))
+    errors = part_errors(port, stepped, np.concatenate(qpos), np.array(hand))
     touching = np.array(contact)
     worst = np.max(list(errors.values()), 0)
     split = {"contact": touching, "no_contact": ~touching}
@@ -225,7 +235,7 @@ def measure_open_loop(port: Port, rollouts: list[Rollout]) -> list[dict[str, Any
     chosen = [r for r in rollouts if r.task in TASKS]
     steps = min(OPEN_LOOP_STEPS[-1], min(len(r.action) for r in chosen))
     start = np.zeros(1, np.int64)
-    states = [port_states(r, start, r.prev_frame[start + 1]) for r in chosen]
+    states = [port.states(r, start, r.prev_frame[start + 1]) for r in chosen]
     state = jax.tree.map(lambda *x: np.concatenate(x), *states)
     marks = [step for step in OPEN_LOOP_STEPS if step <= steps]
     errors: dict[int, dict[str, np.ndarray]] = {}
@@ -234,7 +244,7 @@ def measure_open_loop(port: Port, rollouts: list[Rollout]) -> list[dict[str, Any
         if step in marks:
             # The hand of row t + 1's previous frame is the hand of row t, unclipped.
             hand = np.stack([_hand(r, step) for r in chosen])
-            errors[step] = part_errors(state, np.stack([r.qpos[step] for r in chosen]), hand)
+            errors[step] = part_errors(port, state, np.stack([r.qpos[step] for r in chosen]), hand)
     results = []
     for task in TASKS:
         lanes = np.array([r.task == task for r in chosen])

@@ -3,12 +3,13 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from env_fixtures import GOALS, LANE_GOALS, LANE_TASKS
 
 from envs import parity_parts
-from envs.parity_parts import SUCCESS_DISTANCE, THRESHOLD_BAND, port_states
+from envs.parity_parts import SUCCESS_DISTANCE, THRESHOLD_BAND
 from envs.reference import ReferenceEnv
 from envs.rewards import gaussian, hamacher_product, long_tail
 from envs.sawyer import Ml4Env
@@ -30,7 +31,7 @@ def verdicts(port, rollout, slides, row=100):
     """Ours and Meta-World's verdicts on one state of a rollout with other slide positions."""
     reference, theirs = ReferenceEnv(rollout.task), []
     rows = np.full(len(slides), row)
-    states = port_states(rollout, rows, rollout.prev_frame[rows])
+    states = port.states(rollout, rows, rollout.prev_frame[rows])
     states.physics.qpos[:, SLIDE] = slides
     for slide in states.physics.qpos[:, SLIDE].astype(np.float64):
         state = rollout.state(row)
@@ -60,7 +61,7 @@ def test_slides_across_the_success_threshold(port, rollouts, task):
 def test_drawer_open_succeeds_exactly_at_its_joint_limit(port, rollouts):
     """0.19 - 0.16 <= 0.03 holds in float64 and would not in float32."""
     rollout = next(r for r in rollouts if r.task == "drawer-open")
-    states = port_states(rollout, np.array([100]), rollout.prev_frame[[100]])
+    states = port.states(rollout, np.array([100]), rollout.prev_frame[[100]])
     states.physics.qpos[:, SLIDE] = -0.16
     assert port.in_pieces(port.observe, states, rollout.action[[99]]).success.all()
     reference, state = ReferenceEnv("drawer-open"), rollout.state(100)
@@ -81,7 +82,9 @@ def test_states_of_whole_episodes(port, rollouts, task):
 def test_a_shown_goal_is_the_clipped_target_and_a_hidden_one_zeros(port, rollouts):
     env = Ml4Env(goal_observable=True)
     observe = jax.jit(jax.vmap(lambda s, p, a: env.observe(s, s.physics, p, a)))
-    shown_start = np.asarray(jax.vmap(env.reset_to)(LANE_TASKS, LANE_GOALS).obs)
+    shown_start = np.asarray(
+        jax.vmap(env.reset_to)(*map(jnp.asarray, (LANE_TASKS, LANE_GOALS))).obs
+    )
     hidden_start = np.asarray(port.reset(LANE_TASKS, LANE_GOALS).obs)
     np.testing.assert_array_equal(hidden_start[:, :36], shown_start[:, :36])
     assert not hidden_start[:, 36:].any()
@@ -94,7 +97,7 @@ def test_a_shown_goal_is_the_clipped_target_and_a_hidden_one_zeros(port, rollout
         np.testing.assert_allclose(shown_start[lane], start, atol=1e-6)
         obs = reference.inject(rollout.state(50), rollout.action[49])[0]
         rows = np.array([50])
-        states = port_states(rollout, rows, rollout.prev_frame[rows])
+        states = port.states(rollout, rows, rollout.prev_frame[rows])
         positions = jax.tree.map(lambda x: np.float32(x)[None], parity_parts.positions(reference))
         ours = observe(states, positions, rollout.action[[49]])
         np.testing.assert_allclose(ours.obs[0], obs, atol=1e-6)
@@ -111,12 +114,12 @@ def env_space(reference):
 def test_reward_parts_at_their_definition():
     """dm_control's tolerance is 1 inside the bound and 0.1 at bound + margin."""
     for shape in (long_tail, gaussian):
-        np.testing.assert_allclose(shape(np.float32(0.05), 0.05, 0.2), 1.0)
-        np.testing.assert_allclose(shape(np.float32(0.25), 0.05, 0.2), 0.1, rtol=1e-5)
+        np.testing.assert_allclose(shape(jnp.float32(0.05), 0.05, 0.2), 1.0)
+        np.testing.assert_allclose(shape(jnp.float32(0.25), 0.05, 0.2), 0.1, rtol=1e-5)
     for a, b in [(0.0, 0.0), (0.0, 0.7), (1.0, 1.0), (0.2, 0.9)]:
         expected = a * b / (a + b - a * b) if a or b else 0.0
         np.testing.assert_allclose(
-            hamacher_product(np.float32(a), np.float32(b)), expected, rtol=1e-6
+            hamacher_product(jnp.float32(a), jnp.float32(b)), expected, rtol=1e-6
         )
 
 

@@ -1,5 +1,7 @@
 """Constraint rows against MuJoCo's own, and the solver against a general minimiser in float64."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -62,7 +64,8 @@ def problem(seed: int, rows: int = 40, equalities: int = 6):
     force = 5 * rng.standard_normal(10)
     weight = 10 ** rng.uniform(-1, 2, rows) * (rng.random(rows) < 0.8)
     jacobian, reference = rng.standard_normal((rows, 10)), 10 * rng.standard_normal(rows)
-    return mass, force, Rows(jacobian, weight, reference), equalities
+    rows_of_it: Any = (jacobian, weight, reference)
+    return mass, force, Rows(*rows_of_it), equalities
 
 
 def cost(a, mass, force, rows, equalities):
