@@ -1,8 +1,8 @@
 """`train.py bench`: what this machine does a second, as JSON rows that are flushed one by one.
 
-Kinds of rows (`--rows`): mjx (control steps), learner (gradient steps), start (seconds from the
-command to the end of the first iteration, with an empty and a filled compilation cache, and peak
-memory). Every figure is of `configs/ml4.yaml`, the main job.
+Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench_physics.py`; here are
+the learner (gradient steps) and the start (seconds from the command to the end of the first
+iteration, with an empty and a filled compilation cache, and peak memory), both of the main job.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from cmrl_jax import bench_physics
+from cmrl_jax.bench_physics import best_seconds
 from cmrl_jax.collect import init_run
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import load_config
@@ -28,11 +29,10 @@ from cmrl_jax.metrics import package_versions
 from cmrl_jax.replay import Transition, add
 from cmrl_jax.session import Session, prepare_jax
 from envs.sawyer import ACTION_SIZE, OBS_SIZE
-from envs.tasks import TASKS
 
 CONFIG = "ml4.yaml"
-LANES = (32, 256, 512)
-CONTROL_STEPS, GRADIENT_STEPS, REPEATS = 20, 100, 3
+LANES = (32, 256, 512, 2048)
+GRADIENT_STEPS = 100
 
 
 class Report:
@@ -55,42 +55,9 @@ class Report:
         print(f"{name:<30} {value:>10.1f} {unit:<8} {shown}", flush=True)
 
 
-def best_seconds(run: Callable[[], Any]) -> float:
-    """The shortest of a few runs: other work on the machine only ever adds time."""
-    seconds = []
-    for _ in range(REPEATS):
-        started = time.perf_counter()
-        jax.block_until_ready(run())
-        seconds.append(time.perf_counter() - started)
-    return min(seconds)
-
-
-def bench_mjx(session: Session, report: Report) -> None:
-    """Control steps a second of all four tasks with random actions, by number of lanes."""
-    env = session.env
-
-    def steps(state, key):
-        def step(state, key):
-            action = jax.random.uniform(key, (len(state.steps), ACTION_SIZE), minval=-1, maxval=1)
-            return jax.vmap(env.step)(state, action), None
-
-        return jax.lax.scan(step, state, jax.random.split(key, CONTROL_STEPS))[0]
-
-    for lanes in LANES:
-        task = jnp.arange(lanes) % len(TASKS)
-        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), lanes), task)
-        started = time.perf_counter()
-        compiled = jax.jit(steps).lower(state, jax.random.key(1)).compile()
-        compile_s = time.perf_counter() - started
-        seconds = best_seconds(lambda: compiled(state, jax.random.key(1)))
-        rate = lanes * CONTROL_STEPS / seconds
-        report.add("mjx/control_steps_per_s", rate, "1/s", lanes=lanes)
-        report.add("mjx/compile_s", compile_s, "s", lanes=lanes)
-
-
-def bench_learner(session: Session, report: Report) -> None:
+def bench_learner(config: Config, report: Report) -> None:
     """Gradient steps a second on rings full of random transitions."""
-    config, learner = session.config, session.learner
+    learner = Session(config).learner
     run = jax.jit(lambda key: init_run(config, learner, key))(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), 4)
     lead = (config.env.horizon, len(config.tasks.train), run.replay.lanes_per_task)
@@ -120,7 +87,7 @@ def bench_learner(session: Session, report: Report) -> None:
     report.add("learner/gradient_steps_per_s", GRADIENT_STEPS / seconds, "1/s", batch=shape)
 
 
-def bench_start(report: Report) -> None:
+def bench_start(config: Config, report: Report) -> None:
     """Two processes of the main job: the first compiles, the second finds everything compiled."""
     with tempfile.TemporaryDirectory() as folder:
         for name in ("cold", "warm"):
@@ -159,25 +126,30 @@ def peak_memory_mb(pid: int) -> float:
     raise RuntimeError("the kernel reports no peak memory")
 
 
+KINDS = {
+    "mjx": lambda config, report: bench_physics.bench_backend("mjx", LANES, report),
+    "native": lambda config, report: bench_physics.bench_backend("native", LANES, report),
+    "rollout": lambda config, report: bench_physics.bench_rollout(report),
+    "metaworld": lambda config, report: bench_physics.bench_metaworld(report),
+    "metaworld_vector": lambda config, report: bench_physics.bench_metaworld_vector(report),
+    "learner": bench_learner,
+    "start": bench_start,
+    "naive": lambda config, report: bench_physics.bench_naive(report),
+}
+
+
 def main(json_path: Path, rows: tuple[str, ...]) -> int:
     """Measures the chosen kinds of rows (all by default); returns the exit code.
 
     Raises:
         ConfigError: an unknown kind.
     """
-    kinds = ("mjx", "learner", "start")
     for row in rows:
-        if row not in kinds:
-            raise ConfigError(f"unknown rows '{row}'", f"choose from: {', '.join(kinds)}")
-    chosen = rows or kinds
-    config: Config = load_config(CONFIG)
+        if row not in KINDS:
+            raise ConfigError(f"unknown rows '{row}'", f"choose from: {', '.join(KINDS)}")
+    config = load_config(CONFIG)
     report = Report(json_path, prepare_jax(config))
-    if {"mjx", "learner"} & set(chosen):
-        session = Session(config)
-        if "mjx" in chosen:
-            bench_mjx(session, report)
-        if "learner" in chosen:
-            bench_learner(session, report)
-    if "start" in chosen:
-        bench_start(report)
+    for kind, measure in KINDS.items():
+        if kind in (rows or KINDS):
+            measure(config, report)
     return 0

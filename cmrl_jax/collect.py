@@ -29,8 +29,7 @@ LATE_STEPS = 50  # the last steps of an episode, whose mean reward shows the gri
 Z_SOURCES = ("prior", "text", "posterior")
 
 
-@struct.dataclass
-class RunState:
+class RunState(struct.PyTreeNode):
     """Everything that flows from one iteration to the next."""
 
     learner: TrainState
@@ -188,7 +187,8 @@ def make_train_iteration(
 
     def store(run: RunState, transitions: Transition) -> RunState:
         """A chunk (time, task, lane, ...) into rings and running statistics."""
-        state = run.learner.replace(
+        state = replace(
+            run.learner,
             obs_stats=normalizers.update_obs_stats(run.learner.obs_stats, transitions.obs),
             return_stats=normalizers.update_return_stats(
                 run.learner.return_stats, transitions.reward, transitions.first, config.sac.gamma
