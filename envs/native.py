@@ -219,7 +219,7 @@ class NativePhysics:
                     i = todo.popleft()
                 except IndexError:
                     return
-                if is_sound[i]:
+                if is_sound[i]:  # MuJoCo would find it out, too, and write a log file
                     simulator = self._simulator(int(scenes[i]))
                     simulator.load(given[i], placement[i])
                     is_sound[i] = simulator.advance(carried[i])
@@ -229,7 +229,7 @@ class NativePhysics:
         for job in jobs:
             job.result()
         results = (carried.view(np.uint32), *_positions(carried, bodies, sites), is_sound)
-        return tuple(result.reshape(*lead, *result.shape[1:]) for result in results)
+        return tuple(result.reshape(lead + result.shape[1:]) for result in results)
 
 
 def _given(carried: np.ndarray, action: np.ndarray) -> np.ndarray:

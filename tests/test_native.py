@@ -105,6 +105,9 @@ def test_threads_order_and_history_do_not_change_a_bit(env, replay):
     shuffled = replay(jax.tree.map(lambda x: x[order], state), actions[:, order])
     assert_same(shuffled, jax.tree.map(lambda x: x[:, order], expected))
 
+    alone = jax.jit(env.step)(jax.tree.map(lambda x: x[5], state), actions[0, 5])
+    assert_same(alone, jax.tree.map(lambda x: x[0, 5], expected))
+
     for threads in (1, 2, 4):
         other = Ml4Env(physics="native")
         other.physics = NativePhysics(threads)
@@ -159,7 +162,10 @@ def poison_native(physics, lane, number=np.nan):
 
 
 @pytest.mark.parametrize("backend", ["mjx", "native"])
-def test_a_lane_forced_to_nan_is_reset_counted_and_harmless(backend, env, port, request):
+def test_a_lane_forced_to_nan_is_reset_counted_and_harmless(
+    backend, env, port, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     step = port.step if backend == "mjx" else jax.jit(jax.vmap(env.step))
     poison = poison_mjx if backend == "mjx" else poison_native
     begin = (port.reset if backend == "mjx" else lambda t, g: reset(env, t, g))(
@@ -178,7 +184,7 @@ def test_a_lane_forced_to_nan_is_reset_counted_and_harmless(backend, env, port, 
         if number == 0:  # put back to the settled start, with its own goal
             restarted = jax.tree.map(lambda x: np.asarray(x)[lane], sick.physics)
             assert_same(restarted, jax.tree.map(lambda x: np.asarray(x)[lane], begin.physics))
-    assert not healthy.faults.any()
+    assert not healthy.faults.any() and not list(tmp_path.iterdir())  # no MUJOCO_LOG.TXT
 
 
 @pytest.mark.parametrize("number", [1e11, 1e7], ids=["at the start", "within the step"])
