@@ -132,13 +132,16 @@ def load_gripper(model: mujoco.MjModel) -> Gripper:
     }
     roots = [on_body(f"{side}pad", np.array([(_PAD_ROOT, 0.0, 0.0)])) for side in ("right", "left")]
     material = _material(model, [*mesh, *fingers])  # 0: base; 1..4: finger boxes
-    # A finger is a claw and a pad, nearly at one place: half of its spheres have either's material,
-    # crosswise, so that neither edge of a finger is the rougher one.
+    # A finger is a claw and a pad, 3 mm apart: half of its spheres stand for either, crosswise, so
+    # that neither edge of a finger is the rougher one.
+    centers = in_link(data.geom_xpos[fingers])
     sphere_index = [1, 2, 2, 1, 4, 3, 3, 4] + [0] * len(base_spheres)
+    for side, (claw, pad) in {"right": (0, 1), "left": (2, 3)}.items():
+        pads[side][[0, 3]] += centers[claw] - centers[pad]
     rotation = link_rot.T @ data.body("hand").xmat.reshape(3, 3)
     axes = [link_rot.T @ data.xaxis[model.joint(name).id] for name in ("r_close", "l_close")]
     return Gripper(
-        finger_center=in_link(data.geom_xpos[fingers]),
+        finger_center=centers,
         finger_half=model.geom_size[fingers].copy(),
         finger_part=np.array([RIGHT, RIGHT, LEFT, LEFT]),
         finger_material=_repeat(material, [1, 2, 3, 4]),

@@ -230,9 +230,11 @@ def _touching(reference: ReferenceEnv) -> bool:
     return bool((data.contact.efc_address >= 0).any())
 
 
-def measure_open_loop(port: Port, rollouts: list[Rollout]) -> list[dict[str, Any]]:
+def measure_open_loop(
+    port: Port, rollouts: list[Rollout], tasks: Sequence[str] = TASKS
+) -> list[dict[str, Any]]:
     """Part 3: their recorded actions replayed from their start state; errors grow over time."""
-    chosen = [r for r in rollouts if r.task in TASKS]
+    chosen = [r for r in rollouts if r.task in tasks]
     steps = min(OPEN_LOOP_STEPS[-1], min(len(r.action) for r in chosen))
     start = np.zeros(1, np.int64)
     states = [port.states(r, start, r.prev_frame[start + 1]) for r in chosen]
@@ -246,7 +248,7 @@ def measure_open_loop(port: Port, rollouts: list[Rollout]) -> list[dict[str, Any
             hand = np.stack([_hand(r, step) for r in chosen])
             errors[step] = part_errors(port, state, np.stack([r.qpos[step] for r in chosen]), hand)
     results = []
-    for task in TASKS:
+    for task in tasks:
         lanes = np.array([r.task == task for r in chosen])
         by_step = {step: {n: e[lanes] for n, e in errors[step].items()} for step in marks}
         worst = {step: np.max(list(parts.values()), 0) for step, parts in by_step.items()}

@@ -1,0 +1,87 @@
+"""The MJX backend against MuJoCo C: single steps, and what stops the hand."""
+
+import numpy as np
+from env_fixtures import GOALS, LANE_GOALS, LANE_TASKS, LANES
+
+from envs import parity_parts
+from envs.reference import ReferenceEnv
+from envs.tasks import HAND_HIGH, HAND_LOW, TASKS
+
+# Hand targets (m; x, y, z from the fixture unless the third row says table) and finger effort, by
+# lane: first the way there, then into something solid, a few centimetres deep.
+PATHS = {
+    "drawer-open": [
+        ("case top", (0.0, 0.0, 0.35), (0.0, 0.0, 0.13)),
+        ("case side", (0.25, 0.0, 0.10), (0.15, 0.0, 0.10)),
+        ("table", (0.30, -0.35, 0.15), (0.30, -0.35, 0.0)),
+    ],
+    "drawer-close": [
+        ("inside of the drawer", (0.0, -0.15, 0.35), (0.0, -0.15, 0.05)),
+        ("case top", (0.0, 0.02, 0.35), (0.0, 0.02, 0.13)),
+        ("table", (-0.35, -0.30, 0.20), (-0.35, -0.30, 0.0)),
+    ],
+    "window-open": [
+        ("frame", (0.10, -0.01, 0.30), (0.10, -0.01, 0.12)),
+        ("handle", (0.0, -0.20, -0.01), (0.0, -0.10, -0.01)),
+        ("table", (0.35, -0.20, 0.05), (0.35, -0.20, -0.15)),
+    ],
+    "window-close": [
+        ("frame", (0.0, 0.0, 0.28), (0.0, 0.0, 0.10)),
+        ("wall", (0.35, 0.0, 0.05), (0.35, 0.2, -0.10)),
+        ("table", (-0.40, -0.20, 0.05), (-0.40, -0.20, -0.15)),
+    ],
+}
+WAY, PUSH, REST = 60, 60, 15  # control steps; in the last of them the hand rests
+
+
+def test_single_steps_are_mujocos(port, rollouts):
+    """Without contact to float32; with contact up to the friction cone's shape (see README)."""
+    for task, result in zip(TASKS, parity_parts.measure_injected(port, rollouts), strict=True):
+        free, touching = result["one_step"]["no_contact"], result["one_step"]["contact"]
+        assert free["states"] > 30 and touching["states"] > 10, task
+        assert free["hand"]["p50"] < 5e-7 and free["fingers"]["p50"] < 1e-7, task
+        assert free["fixture"]["p50"] < 1e-7, task
+        assert touching["hand"]["p50"] < 3e-3 and touching["hand"]["max"] < 6e-3, task
+        assert touching["fixture"]["p50"] < 2e-3 and touching["fixture"]["max"] < 4e-3, task
+
+
+def test_recorded_actions_without_contact_lead_to_the_same_place(port, rollouts):
+    chosen = [r for r in rollouts if r.task != "drawer-close"]  # which starts in contact
+    scripted = chosen[::3]
+    results = parity_parts.measure_open_loop(port, scripted, tuple(r.task for r in scripted))
+    for result in results:
+        assert result["open_loop"]["50"] < 2e-6  # the hand reaches the handle after about 60
+        assert result["open_loop"]["100"] < 0.02
+
+
+def hand_paths(port):
+    """Both sides' hands (step, lane, 3) on the way along `PATHS`, each from its own start."""
+    names = [(task, *path) for task in TASKS for path in PATHS[task]]
+    actions = np.zeros((WAY + PUSH, LANES, 4), np.float32)
+    theirs = np.zeros((WAY + PUSH, LANES, 3))
+    for lane, (task, _, way, push) in enumerate(names):
+        env, place = ReferenceEnv(task), GOALS.reshape(-1, 3)[lane]
+        env.reset(place)
+        mocap = env.get_state().mocap_pos
+        for step in range(WAY + PUSH):
+            target = place + (way if step < WAY else push)
+            move = np.clip((target - mocap) * 100, -1, 1)
+            actions[step, lane] = *move, -1
+            mocap = np.clip(mocap + actions[step, lane, :3] / 100, HAND_LOW, HAND_HIGH)
+            env.step(actions[step, lane])
+            theirs[step, lane] = env.positions().hand
+    state, ours = port.reset(LANE_TASKS, LANE_GOALS), []
+    for action in actions:
+        state = port.step(state, action)
+        ours.append(np.asarray(state.frame)[:, :3])
+    return [(task, what) for task, what, *_ in names], np.array(ours), theirs
+
+
+def test_solid_things_stop_the_hand_where_meta_world_does(port):
+    """Within 1 cm, so that a policy can reach neither into the case nor through the table."""
+    names, ours, theirs = hand_paths(port)
+    gap = np.linalg.norm(ours - theirs, axis=-1)[-REST:].max(0)  # (lane,)
+    assert gap.max() < 0.01, sorted(zip(gap.round(4).tolist(), names, strict=True))
+    push = np.array([path[2] for task in TASKS for path in PATHS[task]])
+    short = np.linalg.norm(theirs[-1] - (GOALS.reshape(-1, 3) + push), axis=-1)
+    assert (short > 0.02).sum() >= 9  # most of the way into the solid was indeed barred
