@@ -266,7 +266,7 @@ class _Run:
 
     def seconds_left(self) -> float:
         share = self.share_done()
-        return self.wall * (1 - share) / share if share else math.inf
+        return self.wall * max(1 / share - 1, 0.0) if share else math.inf
 
     def trees(self, state: RunState) -> dict[str, Any]:
         learner = {"state": state.learner, "key": state.key, "iteration": state.iteration}

@@ -141,7 +141,11 @@ def test_missing_extra(refused, monkeypatch):
         (["--resume"], "no --config given", "ml4.yaml"),
         (["trian"], "unknown command 'trian'", "did you mean 'train'?"),
         (["configs/ml4.yaml"], "unknown command 'configs/ml4.yaml'", "--config ml4.yaml"),
-        (["sweep", "--runs", "x"], "the command 'sweep' is not built yet", "train, eval, plot, bench"),
+        (
+            ["sweep", "--runs", "x"],
+            "the command 'sweep' is not built yet",
+            "train, eval, plot, bench",
+        ),
         (["goals"], "the command 'goals' is not built yet", "train, eval, plot, bench"),
         (["--config", "ml4.yaml", "--sac.rl", "1"], "unknown argument '--sac.rl'", "'--sac.lr'?"),
         (["--config", "ml4.yaml", "--sac.rl=1"], "unknown argument '--sac.rl'", "'--sac.lr'?"),
@@ -190,7 +194,8 @@ def test_other_exceptions_keep_their_traceback(calls, monkeypatch):
 def test_eval_hands_over_its_flags(calls, here):
     make_run(here / "r")
     words = ["--k", "0,1,5", "--goals", "4", "--goal-set", "fresh:7", "--seed", "3"]
-    words += ["--horizon", "500", "--checkpoint", "12", "--physics", "native", "--json", "out/f.json"]
+    words += ["--horizon", "500", "--checkpoint", "12", "--physics", "native"]
+    words += ["--json", "out/f.json"]
     assert main(["eval", "--run", "r", *words]) == 0
     assert main(["eval", "--run", "r"]) == 0
     assert calls[0][2] == {

@@ -55,7 +55,8 @@ def test_product_matches_a_loop_over_factors(form):
             expected = product_by_loop(
                 mean[i, :, d], variance[i, :, d], mask[i], goal, goal_mask[i], form
             )
-            np.testing.assert_allclose((got.mean[i, d], got.variance[i, d]), expected, rtol=2e-5, atol=1e-6)
+            found = (got.mean[i, d], got.variance[i, d])
+            np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("form", ["pearl", "prior_tempered"])

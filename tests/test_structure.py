@@ -18,12 +18,15 @@ MODULES = {
     for path in sorted((ROOT / folder).rglob("*.py"))
 }
 # Read and checked before jax is imported.
-LIGHT = {"config", "validate", "config_io", "run_dir", "cli"}
+LIGHT = {"config", "validate", "config_io", "run_dir", "stop", "cli"}
 # A module imports from its own row and later ones; modules not named here only make no cycle.
 ROWS = (
     {"cli"},
-    {"trainer", "evaluate_cli", "bench"},
-    {"collect", "evaluate", "learner", "checkpoint", "metrics"},
+    {"trainer", "evaluate_cli", "bench", "plots"},
+    {"session", "bench_physics", "checkpoint", "metrics"},
+    {"collect", "evaluate"},
+    {"rollout"},
+    {"learner"},
     {"losses", "objectives", "context", "replay"},
     {"networks", "layers", "distributions", "normalizers", "goals", "run_dir", "config_io"},
     {"validate"},
