@@ -169,9 +169,9 @@ def _injected_task(port: Port, task: str, rollouts: list[Rollout]) -> dict[str, 
             success.append(verdict[2])
             distance.append(verdict[3]["obj_to_target"])
             exact.append(positions(reference))
-            touching = _touching(reference)
+            touching = is_touching(reference)
             reference.inject(rollout.state(row + 1), rollout.action[row])
-            contact.append(touching or _touching(reference))
+            contact.append(touching or is_touching(reference))
             hand.append(reference.positions().hand)
     stack = lambda trees: jax.tree.map(lambda *x: np.concatenate(x), *trees)
     exact = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *exact)
@@ -224,7 +224,7 @@ def positions(reference: ReferenceEnv) -> Positions:
     )
 
 
-def _touching(reference: ReferenceEnv) -> bool:
+def is_touching(reference: ReferenceEnv) -> bool:
     """Whether any contact pushes: in free space the gripper touches nothing, not even itself."""
     data: Any = reference.env.data
     return bool((data.contact.efc_address >= 0).any())

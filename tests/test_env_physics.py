@@ -55,10 +55,10 @@ def test_recorded_actions_without_contact_lead_to_the_same_place(port, rollouts)
 
 
 def hand_paths(port):
-    """Both sides' hands (step, lane, 3) on the way along `PATHS`, each from its own start."""
+    """Names, both sides' hands (step, lane, 3) along `PATHS`, whether theirs ends in contact."""
     names = [(task, *path) for task in TASKS for path in PATHS[task]]
     actions = np.zeros((WAY + PUSH, LANES, 4), np.float32)
-    theirs = np.zeros((WAY + PUSH, LANES, 3))
+    theirs, is_barred = np.zeros((WAY + PUSH, LANES, 3)), np.zeros(LANES, bool)
     for lane, (task, _, way, push) in enumerate(names):
         env, place = ReferenceEnv(task), GOALS.reshape(-1, 3)[lane]
         env.reset(place)
@@ -70,18 +70,21 @@ def hand_paths(port):
             mocap = np.clip(mocap + actions[step, lane, :3] / 100, HAND_LOW, HAND_HIGH)
             env.step(actions[step, lane])
             theirs[step, lane] = env.positions().hand
+        is_barred[lane] = parity_parts.is_touching(env)
     state, ours = port.reset(LANE_TASKS, LANE_GOALS), []
     for action in actions:
         state = port.step(state, action)
         ours.append(np.asarray(state.frame)[:, :3])
-    return [(task, what) for task, what, *_ in names], np.array(ours), theirs
+    return [(task, what) for task, what, *_ in names], np.array(ours), theirs, is_barred
 
 
 def test_solid_things_stop_the_hand_where_meta_world_does(port):
-    """Within 1 cm, so that a policy can reach neither into the case nor through the table."""
-    names, ours, theirs = hand_paths(port)
+    """Within 1 cm, so that a policy cannot reach into the case or through a frame.
+
+    The mocap box keeps open fingers 9 mm above the table and off the wall: there nothing touches.
+    """
+    names, ours, theirs, is_barred = hand_paths(port)
     gap = np.linalg.norm(ours - theirs, axis=-1)[-REST:].max(0)  # (lane,)
     assert gap.max() < 0.01, sorted(zip(gap.round(4).tolist(), names, strict=True))
-    push = np.array([path[2] for task in TASKS for path in PATHS[task]])
-    short = np.linalg.norm(theirs[-1] - (GOALS.reshape(-1, 3) + push), axis=-1)
-    assert (short > 0.02).sum() >= 9  # most of the way into the solid was indeed barred
+    free = {what for (_, what), barred in zip(names, is_barred, strict=True) if not barred}
+    assert free == {"table", "wall"}
