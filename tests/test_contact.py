@@ -13,6 +13,7 @@ from envs.contact import (
     mix,
     point_box,
     sphere_box_contacts,
+    stem_box,
 )
 from envs.geometry import Material, load_gripper, load_shapes
 from envs.model import FIXTURE_BODY, LEFT_FINGER, RIGHT_FINGER, SLIDE, load_fixture, load_scene
@@ -42,6 +43,30 @@ def test_point_box_equals_mujocos_distance():
         # Stepping back along the normal lands on the surface.
         assert abs(np.max(np.abs(point - n * d) - half)) < 1e-5
     assert (np.asarray(dist) < 0).mean() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("point", "dist", "normal"),
+    [
+        ((0.0, 0.0, 0.03), 0.02, (0, 0, 1)),  # above the plate
+        ((0.0, 0.0, 0.008), -0.002, (0, 0, 1)),  # in its upper half
+        ((0.0, 0.0, -0.009), -0.019, (0, 0, 1)),  # in its lower half: not out at the bottom
+        ((0.0, 0.0, -0.03), -0.04, (0, 0, 1)),  # through it
+        ((0.198, 0.0, -0.009), -0.002, (1, 0, 0)),  # a nearer way out, at the side
+        ((0.23, 0.0, -0.03), np.hypot(0.03, 0.02), None),  # beside it
+    ],
+)
+def test_a_stick_is_pushed_back_the_way_it_came(point, dist, normal):
+    half, point = jnp.array([0.2, 0.2, 0.01]), jnp.array(point)
+    stem = point.at[2].set(0.1)
+    got, out = stem_box(stem, point, half)
+    np.testing.assert_allclose(got, dist, atol=1e-6)
+    assert normal is None or (np.asarray(out) == normal).all()
+    # Seen from below everything is mirrored.
+    mirror = jnp.array([1.0, 1.0, -1.0])
+    got, mirrored = stem_box(stem * mirror, point * mirror, half)
+    np.testing.assert_allclose(got, dist, atol=1e-6)
+    np.testing.assert_allclose(mirrored * mirror, out, atol=1e-6)
 
 
 @pytest.fixture(scope="module")
