@@ -130,6 +130,7 @@ def make_train_iteration(
         goal = jax.vmap(lambda k: jax.random.randint(k, (), 0, goals))(lane_key)
         return jax.vmap(env.reset_to)(env_task, placements[train_task, goal])
 
+    @jax.jit  # so that `skip_steps`, which only asks for shapes, does not trace it once more
     def train_steps(run: RunState, key: jax.Array) -> tuple[RunState, dict[str, jax.Array]]:
         """The chunk's gradient steps; metrics are their means."""
 

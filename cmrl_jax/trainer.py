@@ -110,13 +110,13 @@ class _Run:
         # Jitted, so that every leaf has a buffer of its own: the iteration donates them all.
         self.init = jax.jit(lambda key: init_run(self.config, self.session.learner, key))
         abstract = jax.eval_shape(self.init, jax.random.key(0))
-        metrics = jax.eval_shape(iteration, abstract)[1]
-        self.start(abstract, self.columns(metrics), resume)
+        # Traced once, for the columns and for the program: tracing the physics takes seconds.
+        traced = jax.jit(iteration, donate_argnums=0).trace(abstract)
+        self.start(abstract, self.columns(traced.out_info[1]), resume)
         try:
             if self.iterations_left() and not self.stop.requested:
-                jitted = jax.jit(iteration, donate_argnums=0)
                 self.iteration = self.timed(
-                    "the training iteration", lambda: jitted.lower(self.state).compile()
+                    "the training iteration", lambda: traced.lower().compile()
                 )
             while self.iterations_left() and not self.stop.requested:
                 self.step()
