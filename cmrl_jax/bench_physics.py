@@ -201,7 +201,10 @@ def bench_metaworld_vector(report: Report) -> None:
     """Gymnasium's asynchronous vector environment of it, one process an environment."""
     import gymnasium
 
-    with_processes = gymnasium.vector.AsyncVectorEnv([_metaworld_env] * VECTOR_PROCESSES)
+    # Spawned, not forked: a fork of a process with jax's threads may deadlock.
+    with_processes = gymnasium.vector.AsyncVectorEnv(
+        [_metaworld_env] * VECTOR_PROCESSES, context="spawn"
+    )
     generator = np.random.default_rng(0)
     try:
         with_processes.reset()
