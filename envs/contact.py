@@ -242,8 +242,8 @@ def find_contacts(
     finger_slide: jax.Array,
     placement: jax.Array,
     handle_shift: jax.Array,
-) -> tuple[Contacts, Contacts]:
-    """The kept contacts: with torsional friction (finger boxes on the handle), and without.
+) -> Contacts:
+    """The kept contacts of all three families.
 
     Args:
         link_pos, link_rot: pose of the last arm link, (3,) and (3, 3).
@@ -259,9 +259,15 @@ def find_contacts(
     boxes = sphere_box_contacts(
         gripper, shapes, link_pos, link_rot, finger_slide, placement, handle_shift
     )
-    smooth = jax.tree.map(
-        lambda *leaves: jnp.concatenate(leaves),
-        _deepest(base, BASE_SLOTS),
-        _deepest(boxes, BOX_SLOTS),
+    kept = (
+        _deepest(fingers, FINGER_SLOTS),
+        _without_torsion(_deepest(base, BASE_SLOTS)),
+        _without_torsion(_deepest(boxes, BOX_SLOTS)),
     )
-    return _deepest(fingers, FINGER_SLOTS), smooth
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kept)
+
+
+def _without_torsion(contacts: Contacts) -> Contacts:
+    """Contacts that do not resist spinning about their normal (MuJoCo's condim 3)."""
+    friction = contacts.material.friction.at[:, 1].set(0.0)
+    return contacts._replace(material=contacts.material._replace(friction=friction))

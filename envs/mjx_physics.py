@@ -32,7 +32,7 @@ from envs.model import (
     load_scene,
 )
 from envs.physics import FRAME_SKIP, Positions, settled_starts
-from envs.solver import Rows, make_rows, solve
+from envs.solver import Cones, Rows, make_cones, make_rows, solve
 from envs.tasks import ACTION_SCALE, HAND_HIGH, HAND_LOW
 
 with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp is not installed
@@ -176,15 +176,16 @@ class MjxPhysics:
         slide_force = -fixture.damping * state.qvel[SLIDE]
         force = jnp.append(data.qfrc_smooth, slide_force)
         smooth = jnp.append(data.qacc_smooth, slide_force / fixture.inertia)
-        rows, equalities = self._constraint_rows(state, data, scene)
-        rows = _fence(rows)
+        weld, limits, cones = _fence(self._constraints(state, data, scene))
+        rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), weld, limits)
         acceleration, constraint_force = solve(
             mass,
             force,
             smooth,
             state.warm_start,
             rows,
-            equalities,
+            cones,
+            weld.weight.shape[0],
             SOLVER_ITERATIONS,
             LINE_SEARCH_ITERATIONS,
         )
@@ -209,29 +210,25 @@ class MjxPhysics:
         data = mjx_forward.fwd_actuation(model, data)
         return mjx_forward.fwd_acceleration(model, data)
 
-    def _constraint_rows(self, state: PhysicsState, data: mjx.Data, scene: SceneData):
+    def _constraints(
+        self, state: PhysicsState, data: mjx.Data, scene: SceneData
+    ) -> tuple[Rows, Rows, Cones]:
+        """The weld of the hand, the limits, and the contacts."""
         pos, rot = data.xpos[ARM_JOINTS], data.xmat[ARM_JOINTS]
-        handle_shift = state.placement + scene.fixture.axis * state.qpos[SLIDE]
-        torsional, smooth = _fence(
-            find_contacts(
-                self._gripper,
-                scene.shapes,
-                pos,
-                rot,
-                state.qpos[RIGHT_FINGER : LEFT_FINGER + 1],
-                state.placement,
-                handle_shift,
-            )
+        contacts = find_contacts(
+            self._gripper,
+            scene.shapes,
+            pos,
+            rot,
+            state.qpos[RIGHT_FINGER : LEFT_FINGER + 1],
+            state.placement,
+            state.placement + scene.fixture.axis * state.qpos[SLIDE],
         )
-        weld = self._weld_rows(state, data, pos, rot)
-        groups = [
-            weld,
+        return (
+            self._weld_rows(state, data, pos, rot),
             self._limit_rows(state, scene),
-            self._contact_rows(state, data, scene, torsional, torsional_friction=True),
-            self._contact_rows(state, data, scene, smooth, torsional_friction=False),
-        ]
-        rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *groups)
-        return rows, weld.weight.shape[0]
+            self._contact_cones(state, data, scene, _fence(contacts)),
+        )
 
     def _weld_rows(self, state: PhysicsState, data: mjx.Data, pos, rot) -> Rows:
         """The weld of the hand to the mocap body: three translations, three rotations."""
@@ -295,15 +292,9 @@ class MjxPhysics:
             active=(pos < 0).astype(jnp.float32),
         )
 
-    def _contact_rows(
-        self,
-        state: PhysicsState,
-        data: mjx.Data,
-        scene: SceneData,
-        contacts: Contacts,
-        torsional_friction: bool,
-    ) -> Rows:
-        """Pyramidal friction cones: 4 rows a contact, 6 with torsional friction."""
+    def _contact_cones(
+        self, state: PhysicsState, data: mjx.Data, scene: SceneData, contacts: Contacts
+    ) -> Cones:
         count = contacts.dist.shape[0]
         translate, rotate = jax.vmap(lambda p: self._robot_jacobian(data, p))(contacts.pos)
         fingers = jnp.stack([contacts.part == 1, contacts.part == 2], 1)  # (contact, 2)
@@ -314,29 +305,19 @@ class MjxPhysics:
         relative = jnp.concatenate([-translate, fixture[:, None]], 1)  # (contact, joint, 3)
         frame = jax.vmap(mjx_math.make_frame)(contacts.normal)  # (contact, 3, 3), normal first
         motion = jnp.einsum("cfx,cjx->cfj", frame, relative)
-        normal, friction = motion[:, :1], motion[:, 1:]
-        coefficient = jnp.repeat(contacts.material.friction[:, :1], 2, 1)
-        if torsional_friction:
-            spin = -jnp.einsum("cx,cjx->cj", contacts.normal, rotate * mask[..., None])
-            friction = jnp.concatenate([friction, jnp.pad(spin, ((0, 0), (0, 1)))[:, None]], 1)
-            coefficient = jnp.concatenate([coefficient, contacts.material.friction[:, 1:]], 1)
-        scaled = coefficient[..., None] * friction
-        jacobian = jnp.concatenate([normal + scaled, normal - scaled], 1)  # (contact, edge, joint)
-        edges = jacobian.shape[1]
-        slide2 = jnp.square(contacts.material.friction[:, 0])
-        invweight = contacts.material.invweight * (1 + slide2) * 2 * slide2
+        spin = -jnp.einsum("cx,cjx->cj", contacts.normal, rotate * mask[..., None])
+        spin = jnp.pad(spin, ((0, 0), (0, 1)))[:, None]
         pos = contacts.dist - contacts.material.margin
-        spread = lambda x: jnp.repeat(x, edges, 0)
-        return make_rows(
-            jacobian=jacobian.reshape(-1, JOINTS),
-            pos=spread(pos),
-            impedance_pos=spread(pos),
-            invweight=spread(invweight),
-            solref=spread(contacts.material.solref),
-            solimp=spread(contacts.material.solimp),
+        return make_cones(
+            jacobian=jnp.concatenate([motion, spin], 1),
+            friction=contacts.material.friction,
+            pos=pos,
+            invweight=contacts.material.invweight,
+            solref=contacts.material.solref,
+            solimp=contacts.material.solimp,
             qvel=state.qvel,
             timestep=self.timestep,
-            active=spread((pos < 0).astype(jnp.float32)),
+            active=(pos < 0).astype(jnp.float32),
         )
 
     def _velocity_product(self, state: PhysicsState, data: mjx.Data, point: jax.Array):
