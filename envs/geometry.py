@@ -2,8 +2,8 @@
 
 Everything on the fixture side (boxes and handle capsules) is taken from the scene unchanged; all of
 its boxes are aligned with the world. On the gripper side the two fingers keep their four boxes
-against the handles, the gripper base mesh becomes five capsules, and against boxes both become
-spheres. Every deviation and its measured effect is listed in `README.md`.
+against the handles and the gripper base mesh becomes a polytope of 24 faces; against boxes both
+become spheres. Every deviation and its measured effect is listed in `README.md`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,38 @@ BOXES = 19  # slots a scene; unused ones are parked far below the floor
 HAND, RIGHT, LEFT = 0, 1, 2  # gripper parts: which finger slide, if any, moves a shape
 _PARKED = (0.0, 0.0, -100.0)
 
-# The gripper base mesh as capsules across the hand (metres, frame of body `right_hand`): x and z of
-# the axis, radius, half width with the caps. Least squares of the distance to the mesh's hull over
-# probes on all sides but the arm's, sides that push a window handle counted five times: rms 1.0 mm.
+# The gripper base mesh as a convex polytope (frame of body `right_hand`): outward normals, and how
+# far from the origin each face lies (metres). Least squares of the largest plane distance against
+# the distance to the mesh's hull, over probes up to a handle's radius away, sides that push a
+# window handle counted five times: rms 0.7 mm, 0.5 mm on those sides.
+_BASE_PLANES = (
+    (0.0265, -0.9961, 0.0840, 0.05560),
+    (0.0327, -0.9494, -0.3124, 0.03781),
+    (-0.3673, -0.9277, -0.0671, 0.04904),
+    (-0.3383, -0.8979, 0.2816, 0.06670),
+    (0.3996, -0.8631, 0.3089, 0.06995),
+    (-0.0036, -0.7974, 0.6035, 0.08359),
+    (-0.5476, -0.6310, -0.5495, 0.01903),
+    (0.6675, -0.6134, -0.4220, 0.02807),
+    (0.9623, -0.2701, 0.0338, 0.04218),
+    (0.0141, 0.0000, -0.9999, -0.02874),
+    (-0.9982, 0.0024, -0.0600, 0.02071),
+    (-0.9181, -0.0000, 0.3964, 0.04601),
+    (0.9323, 0.0105, 0.3614, 0.05125),
+    (-0.5494, -0.0073, 0.8355, 0.07171),
+    (0.1401, -0.0015, 0.9901, 0.07998),
+    (0.9511, 0.3071, -0.0335, 0.04028),
+    (0.6787, 0.5749, -0.4570, 0.02512),
+    (-0.4741, 0.6892, -0.5479, 0.02033),
+    (-0.0042, 0.7821, 0.6232, 0.08433),
+    (-0.3529, 0.9347, -0.0425, 0.05028),
+    (-0.3668, 0.8762, 0.3126, 0.06809),
+    (0.3966, 0.8695, 0.2946, 0.06904),
+    (0.1182, 0.9630, -0.2423, 0.04151),
+    (0.0050, 0.9953, 0.0967, 0.05616),
+)
+# Against boxes the base is three spheres (both ends and the middle) on each of five capsules across
+# the hand: x and z of the axis, radius, half width with the caps.
 _BASE_CAPSULES = (
     (-0.0061, 0.0430, 0.0183, 0.0536),
     (0.0197, 0.0361, 0.0199, 0.0338),
@@ -34,8 +63,9 @@ _BASE_CAPSULES = (
 _PAD_SPHERES = ((0.042, -0.012), (0.042, 0.012), (-0.010, -0.012), (-0.010, 0.012))
 _PAD_SPHERE_RADIUS = 0.003
 _PAD_ROOT = -0.045  # where a finger leaves the hand
-# A finger end or side on a box makes eight contacts in MuJoCo, claw and pad four each.
-_FINGER_COUNT, _BASE_COUNT = 4.0, 2.0
+# Contact points of MuJoCo that one of ours stands for. A finger end or side on a box makes eight,
+# claw and pad four each; the base mesh makes two on a handle.
+_FINGER_COUNT, _BASE_COUNT, BASE_HANDLE_COUNT = 4.0, 2.0, 2.0
 
 
 class Material(NamedTuple):
@@ -55,9 +85,9 @@ class Gripper(NamedTuple):
     finger_half: np.ndarray  # (4, 3) half sizes along the hand's axes
     finger_part: np.ndarray  # (4,)
     finger_material: Material
-    base_ends: np.ndarray  # (5, 2, 3) capsules: end points
-    base_radius: np.ndarray  # (5,)
-    base_material: Material
+    base_normal: np.ndarray  # (24, 3) faces of the base polytope, outward
+    base_offset: np.ndarray  # (24,) their distance from the frame's origin
+    base_material: Material  # of one geom
     sphere_center: np.ndarray  # (23, 3)
     sphere_radius: np.ndarray  # (23,)
     sphere_stem: np.ndarray  # (23, 3) a point of the same part well inside the gripper
@@ -117,15 +147,16 @@ def load_gripper(model: mujoco.MjModel) -> Gripper:
     fingers = [model.geom(name).id for name in names]
     mesh = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body("right_hand").id]
     mesh = [g for g in mesh if model.geom_contype[g]]
-    base_ends = np.array(
-        [
-            on_body("right_hand", np.array([(x, -half + r, z), (x, half - r, z)]))
-            for x, z, r, half in _BASE_CAPSULES
-        ]
+    planes = np.array(_BASE_PLANES)
+    hand = data.body("right_hand")
+    base_normal = planes[:, :3] @ (link_rot.T @ hand.xmat.reshape(3, 3)).T
+    base_normal /= np.linalg.norm(base_normal, axis=1, keepdims=True)
+    base_offset = planes[:, 3] + base_normal @ in_link(hand.xpos)
+    base_spheres = on_body(
+        "right_hand",
+        np.array([(x, y, z) for x, z, r, half in _BASE_CAPSULES for y in (r - half, 0, half - r)]),
     )
     base_radius = np.array([r for _, _, r, _ in _BASE_CAPSULES])
-    # Against boxes a capsule is three spheres: both ends and the middle.
-    base_spheres = np.stack([base_ends[:, 0], base_ends.mean(1), base_ends[:, 1]], 1).reshape(-1, 3)
     pads = {
         side: on_body(f"{side}pad", np.array([(x, 0.0, z) for x, z in _PAD_SPHERES]))
         for side in ("right", "left")
@@ -145,9 +176,9 @@ def load_gripper(model: mujoco.MjModel) -> Gripper:
         finger_half=model.geom_size[fingers].copy(),
         finger_part=np.array([RIGHT, RIGHT, LEFT, LEFT]),
         finger_material=_repeat(material, [1, 2, 3, 4]),
-        base_ends=base_ends,
-        base_radius=base_radius,
-        base_material=_repeat(material, [0] * len(base_radius)),
+        base_normal=base_normal,
+        base_offset=base_offset,
+        base_material=Material(*(leaf[0] for leaf in material)),
         sphere_center=np.concatenate([pads["right"], pads["left"], base_spheres]),
         sphere_radius=np.concatenate([np.full(8, _PAD_SPHERE_RADIUS), np.repeat(base_radius, 3)]),
         sphere_stem=np.concatenate(

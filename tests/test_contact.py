@@ -8,10 +8,11 @@ import pytest
 from env_fixtures import GOALS
 
 from envs.contact import (
-    base_capsule_contacts,
+    base_handle_contacts,
     finger_capsule_contacts,
     mix,
     point_box,
+    segment_polytope,
     sphere_box_contacts,
     stem_box,
 )
@@ -107,7 +108,7 @@ def ours(task, states, family):
     pos, rot, fingers, place, shift = single(tuple(np.stack(x) for x in zip(*rows, strict=True)))
     arguments = {
         finger_capsule_contacts: (pos, rot, fingers, shift),
-        base_capsule_contacts: (pos, rot, shift),
+        base_handle_contacts: (pos, rot, shift),
         sphere_box_contacts: (pos, rot, fingers, place, shift),
     }[family]
     gripper, shapes = single(gripper), single(shapes)
@@ -140,24 +141,50 @@ def test_finger_boxes_touch_handles_where_mujocos_do(near_states, task):
 
 
 @pytest.mark.parametrize("task", ["window-open", "window-close"])
-def test_base_capsules_follow_the_mesh(near_states, task):
-    """The mesh is replaced by capsules: within 2 mm where a window handle meets it."""
+def test_the_base_polytope_follows_the_mesh(near_states, task):
+    """The mesh is replaced by 24 faces: within 1 mm where a window handle meets it."""
     env, states = near_states[task]
     model, mesh = env.env.model, None
     body = model.body("right_hand").id
     for geom in range(model.ngeom):
         if model.geom_bodyid[geom] == body and model.geom_contype[geom]:
             mesh = geom
-    contacts = ours(task, states, base_capsule_contacts)
-    dist = np.asarray(contacts.dist).reshape(len(states), -1, 3).min(1)
-    errors = []
+    contacts = ours(task, states, base_handle_contacts)
+    errors, turns = [], []
     for i, (data, _) in enumerate(states):
         for k, handle in enumerate(handle_capsules(task, model)):
-            expected = mujoco.mj_geomDistance(model, data, mesh, handle, 0.02, np.zeros(6))
+            segment = np.zeros(6)
+            expected = mujoco.mj_geomDistance(model, data, mesh, handle, 0.02, segment)
             if -0.002 < expected < 0.005:
-                errors.append(dist[i, k] - expected)
+                errors.append(contacts.dist[i, k] - expected)
+                way = (segment[3:] - segment[:3]) / expected
+                turns.append(way @ np.asarray(contacts.normal[i, k]))
     assert len(errors) > 20
-    assert np.abs(np.median(errors)) < 1e-3 and np.abs(errors).max() < 3e-3
+    assert np.abs(np.median(errors)) < 3e-4 and np.abs(errors).max() < 1.2e-3
+    assert np.median(turns) > 0.99 and min(turns) > 0.9
+
+
+def test_segments_meet_a_polytope_as_a_box():
+    """A box given by its six faces: the box's own distance over faces, never too far at edges."""
+    half = np.array([0.03, 0.02, 0.01])
+    rng = np.random.default_rng(3)
+    start = rng.uniform(-2, 2, (300, 3)) * half
+    along = rng.uniform(-3, 3, (300, 3)) * half
+    normal = np.concatenate([np.eye(3), -np.eye(3)])
+    t, dist, out = jax.jit(segment_polytope)(start, along, normal, np.tile(half, 2))
+    steps = np.linspace(0, 1, 2001)[:, None, None]
+    depth = (np.abs(start + steps * along) - half).max(-1)  # (step, segment), exact inside
+    deepest = depth.min(0)
+    share = np.linalg.norm(out, axis=1)
+    np.testing.assert_allclose(share, 1, atol=1e-5)
+    at = np.abs(start + np.asarray(t)[:, None] * along) - half
+    np.testing.assert_allclose(at.max(-1), deepest, atol=3e-5)
+    inside = deepest < 0
+    assert 50 < inside.sum() < 250 and (np.asarray(dist)[inside] <= deepest[inside] + 3e-5).all()
+    # Moving the segment out along the normal by its depth parts it from the box, or just touches.
+    moved = start - np.asarray(out) * np.asarray(dist)[:, None]
+    gap = (np.abs(moved + steps * along) - half).max(-1).min(0)
+    np.testing.assert_allclose(gap[inside], 0, atol=5e-5)
 
 
 @pytest.mark.parametrize("task", TASKS)
