@@ -172,8 +172,8 @@ def segment_polytope(
         normal, offset: (face, 3), (face,).
 
     Returns:
-        Parameter in [0, 1] of the deepest point (segment,), its signed distance (segment,), exact
-        over faces, and the outward normal (segment, 3).
+        Parameter in [0, 1] of the deepest point (segment,), its largest plane distance (segment,)
+        and the outward normal (segment, 3).
     """
     value, slope = start @ normal.T - offset, along @ normal.T  # (segment, face)
 
@@ -202,10 +202,12 @@ def segment_polytope(
     # Weight of the plane that rises; at an end of the segment one plane alone is met.
     share = jnp.clip(-low[2] / jnp.maximum(high[2] - low[2], _EPS), 0.0, 1.0)
     share = jnp.where(t >= 1.0, 0.0, jnp.where(t <= 0.0, 1.0, share))[:, None]
-    out = (1 - share) * normal[low[0]] + share * normal[high[0]]
-    size = jnp.linalg.norm(out, axis=1)
+    before, after = normal[low[0]], normal[high[0]]
+    # Right through, from one face to the opposite one, there is no way out between the two.
+    share = jnp.where(jnp.sum(before * after, 1, keepdims=True) < -0.5, jnp.round(share), share)
+    out = (1 - share) * before + share * after
     dist = jnp.max(value + t[:, None] * slope, 1)
-    return t, dist / size, out / size[:, None]
+    return t, dist, out / jnp.linalg.norm(out, axis=1, keepdims=True)
 
 
 def base_handle_contacts(

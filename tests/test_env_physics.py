@@ -35,14 +35,14 @@ WAY, PUSH, REST = 60, 60, 15  # control steps; in the last of them the hand rest
 
 
 def test_single_steps_are_mujocos(port, rollouts):
-    """Without contact to float32; with contact up to the friction cone's shape (see README)."""
+    """Without contact to float32; with contact up to the gripper's shape (see README)."""
     for task, result in zip(TASKS, parity_parts.measure_injected(port, rollouts), strict=True):
         free, touching = result["one_step"]["no_contact"], result["one_step"]["contact"]
         assert free["states"] > 30 and touching["states"] > 10, task
         assert free["hand"]["p50"] < 5e-7 and free["fingers"]["p50"] < 1e-7, task
         assert free["fixture"]["p50"] < 1e-7, task
-        assert touching["hand"]["p50"] < 3e-3 and touching["hand"]["max"] < 6e-3, task
-        assert touching["fixture"]["p50"] < 2e-3 and touching["fixture"]["max"] < 4e-3, task
+        assert touching["hand"]["p50"] < 3e-4 and touching["hand"]["max"] < 4e-3, task
+        assert touching["fixture"]["p50"] < 2e-6 and touching["fixture"]["max"] < 3e-3, task
 
 
 def test_recorded_actions_without_contact_lead_to_the_same_place(port, rollouts):
