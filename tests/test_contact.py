@@ -161,7 +161,7 @@ def test_the_base_polytope_follows_the_mesh(near_states, task):
                 turns.append(way @ np.asarray(contacts.normal[i, k]))
     assert len(errors) > 20
     assert np.abs(np.median(errors)) < 7e-4 and np.abs(errors).max() < 2e-3
-    assert np.median(turns) > 0.99 and min(turns) > 0.9
+    assert np.median(turns) > 0.99 and min(turns) > 0.85
 
 
 def test_segments_meet_a_polytope_where_they_are_deepest():
