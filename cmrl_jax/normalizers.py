@@ -11,6 +11,8 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+
+import envs.quiet_mjx  # noqa: F401  # isort: skip, brax imports mjx
 from brax.training.acme import running_statistics
 from flax import struct
 

@@ -7,14 +7,17 @@ stages (cameras, tendons, sensors, its collision driver) are skipped.
 
 from __future__ import annotations
 
-import contextlib
-import io
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+
+from envs.quiet_mjx import mjx  # isort: skip, it comes before mjx's own parts
+from mujoco.mjx._src import forward as mjx_forward
+from mujoco.mjx._src import math as mjx_math
+from mujoco.mjx._src import smooth as mjx_smooth
 
 from envs.contact import Contacts, find_contacts
 from envs.geometry import FixtureShapes, load_gripper, load_shapes
@@ -34,12 +37,6 @@ from envs.model import (
 from envs.physics import FRAME_SKIP, Positions, settled_starts
 from envs.solver import Cones, Rows, make_cones, make_rows, solve
 from envs.tasks import ACTION_SCALE, HAND_HIGH, HAND_LOW
-
-with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp is not installed
-    from mujoco import mjx
-    from mujoco.mjx._src import forward as mjx_forward
-    from mujoco.mjx._src import math as mjx_math
-    from mujoco.mjx._src import smooth as mjx_smooth
 
 SUBSTEPS = FRAME_SKIP
 SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6

@@ -4,7 +4,7 @@
 
 A row is a face: outward normal, distance from the origin (frame of body `right_hand`, metres). The
 largest plane distance is to equal the distance to the mesh's convex hull, at probes up to a window
-handle's radius away from it; the sides that push a handle (+-x) count ten times. Starting planes are
+handle's radius away from it; the sides that push a handle (+-x) count ten times. Planes start as
 means of hull faces that lie within 22 degrees of one another, 15 on those sides.
 """
 

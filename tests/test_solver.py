@@ -1,4 +1,4 @@
-"""Constraint rows and cones against MuJoCo's own, and the solver against a general minimiser in float64."""
+"""Rows and cones against MuJoCo's own, and the solver against a general minimiser in float64."""
 
 from typing import Any
 
@@ -17,7 +17,8 @@ BALL = """
   <default><geom solref="{solref}" solimp="{solimp}" friction=".7 .05 0"/></default>
   <worldbody>
     <geom type="plane" size="1 1 .1" margin=".002"/>
-    <body pos="0 0 {height}"><freejoint/><geom type="sphere" size=".05" mass=".3" condim="4"/></body>
+    <body pos="0 0 {height}"><freejoint/>
+      <geom type="sphere" size=".05" mass=".3" condim="4"/></body>
     <body pos="0 0 2"><joint type="slide" range="{depth} 1" limited="true" solreflimit="{solref}"
       solimplimit="{solimp}"/><geom type="sphere" size=".05" mass=".4"/></body>
   </worldbody></mujoco>"""

@@ -1,0 +1,9 @@
+"""MJX, without the message it prints when warp is not installed. Import it before brax does."""
+
+import contextlib
+import io
+
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx
+
+__all__ = ["mjx"]
