@@ -19,6 +19,7 @@ from flax import struct
 from cmrl_jax import normalizers
 from cmrl_jax import replay as rings
 from cmrl_jax.config import Config, lane_groups, lanes_per_task
+from cmrl_jax.diagnostics import make_diagnose
 from cmrl_jax.learner import Learner, TrainState
 from cmrl_jax.replay import ContextState, ReplayState, Transition
 from cmrl_jax.rollout import rollout
@@ -90,6 +91,7 @@ def make_train_iteration(
     source = np.tile(np.repeat(np.arange(3), groups), num_tasks)  # (lane,) index of Z_SOURCES
     writers = groups[0] if collect.context_lanes == "prior" else per_task
     inference = learner.inference
+    diagnose = make_diagnose(config, learner, goal_vectors)
 
     def by_task(x: jax.Array) -> jax.Array:
         """(time, lane, ...) -> (time, task, lane of the task, ...)."""
@@ -149,7 +151,7 @@ def make_train_iteration(
     def train_iteration(run: RunState) -> tuple[RunState, dict[str, jax.Array]]:
         is_first = run.iteration == 0
         random_actions = is_first & (collect.initial == "random")
-        k_z, k_reset, k_chunks, key = jax.random.split(run.key, 4)
+        k_z, k_reset, k_chunks, k_diagnose, key = jax.random.split(run.key, 5)
         zc, actual_source = draw_conditioning(run, k_z)
 
         def chunk(carry: tuple[RunState, State], key: jax.Array):
@@ -184,6 +186,7 @@ def make_train_iteration(
         metrics["physics_faults"] = jnp.sum(state.faults).astype(jnp.float32)
         denominator = normalizers.reward_denominator(run.learner.return_stats, config.sac)
         metrics["reward_denominator"] = denominator
+        metrics |= diagnose(run.learner, run.replay, run.context, k_diagnose)
         return run.replace(iteration=run.iteration + 1), metrics
 
     def store(run: RunState, transitions: Transition) -> RunState:

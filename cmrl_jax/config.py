@@ -56,7 +56,9 @@ class EnvConfig:
     variation: Literal["episode_random", "fixed_50"] = doc(
         "episode_random", "fixture position at reset: drawn afresh, or from the 50 `train` goals"
     )
-    obs_mode: Literal["metaworld", "canonical"] = doc("metaworld", "observation as Meta-World's")
+    obs_mode: Literal["metaworld", "canonical"] = doc(
+        "metaworld", "as Meta-World's, or canonical: relative to where the object began"
+    )
 
 
 @dataclass(frozen=True)

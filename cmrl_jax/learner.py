@@ -75,6 +75,8 @@ class Learner:
         update: (TrainState, replay_state, context_state, key) -> TrainState, metrics; one
             gradient step. Metrics are float32, () or (T,); with `sac.task_rows` a task that was
             not drawn has NaN.
+        task_losses: (TrainState, replay_state, context_state, key) -> a function of the critics'
+            parameters: the TD loss of every training task on one minibatch, (T,).
         policy: (actor_params, obs_stats, obs (lane, obs) raw, zc (lane, conditioning), key,
             deterministic) -> action (lane, act), Routing or None.
         normalize_obs: (obs_stats, obs (..., obs)) -> (..., obs); the identity by configuration.
@@ -86,6 +88,7 @@ class Learner:
     inference: ContextInference | None
     init: Callable[[jax.Array], TrainState]
     update: Callable[[TrainState, Any, Any, jax.Array], tuple[TrainState, Metrics]]
+    task_losses: Callable[[TrainState, Any, Any, jax.Array], Callable[[Params], jax.Array]]
     policy: Callable[..., tuple[jax.Array, Routing | None]]
     normalize_obs: Callable[[Any, jax.Array], jax.Array]
     task_conditioning: Callable[[jax.Array], jax.Array]
@@ -210,6 +213,24 @@ def make_learner(
             z_noise=noise[:, 2 * actions :],
         )
 
+    def task_losses(
+        state: TrainState, replay_state: Any, context_state: Any, key: jax.Array
+    ) -> Callable[[Params], jax.Array]:
+        data = draw_minibatch(state, replay_state, context_state, key)
+        target_params = state.target_value_params if has_value else state.target_critic_params
+
+        def losses(critic_params: Params) -> jax.Array:
+            side = CriticSide(critic_params, state.encoder_params)
+            _, (_, metrics) = objectives.critic(
+                side, state.actor_params, target_params, state.log_alpha, data
+            )
+            rows = metrics["td_loss"]
+            # A task without a row (`sac.task_rows`) has no loss here, not NaN: it has no gradient.
+            one_hot = jax.nn.one_hot(data.task_ids, num_tasks)
+            return (rows @ one_hot) / jnp.maximum(jnp.sum(one_hot, axis=0), 1.0)
+
+        return losses
+
     step = partial(adam_step, lr=sac.lr, max_norm=sac.grad_clip)
 
     def update(
@@ -284,6 +305,7 @@ def make_learner(
         inference=inference,
         init=init,
         update=update,
+        task_losses=task_losses,
         policy=policy,
         normalize_obs=normalize_obs,
         task_conditioning=task_conditioning,

@@ -46,7 +46,8 @@ class Session:
         self.config = config
         self.eval_tasks = config.tasks.train + config.tasks.test
         self.goals: GoalTable = load_goals(config.goals.table, self.eval_tasks)
-        self.env = call_envs(lambda: Ml4Env(config.env.goal_observable, config.env.physics))
+        env = config.env
+        self.env = call_envs(lambda: Ml4Env(env.goal_observable, env.physics, env.obs_mode))
         self.train_goals = jnp.asarray(self.goals.select(config.tasks.train).vectors)
         self.learner: Learner = make_learner(config, self.train_goals)
 

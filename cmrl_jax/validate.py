@@ -19,7 +19,6 @@ from cmrl_jax.config import (
 # Options of the schema whose code is not there yet: refused by name, so that nobody trains for an
 # hour on a switch that does nothing.
 NOT_BUILT = {
-    "env.obs_mode": ("canonical",),
     "model.critic": ("hlgauss",),
     "model.router_shared": (True,),
     "encoder.aux": ("recon", "contrastive"),

@@ -86,6 +86,7 @@ class Port:
             task_id=zeros(np.int32) + np.int32(task),
             frame=zeros(np.float32, 18) + np.asarray(frames, np.float32),
             obs=zeros(np.float32, OBS_SIZE),
+            origin=zeros(np.float32, 3),
             reward=zeros(np.float32),
             success=zeros(bool),
             distance=zeros(np.float32),

@@ -27,6 +27,8 @@ from envs.tasks import (
 )
 
 OBS_SIZE, ACTION_SIZE, FRAME = 39, 4, 18
+HAND, OBJECT, QUATERNION = slice(0, 3), slice(4, 7), slice(7, 11)  # of a frame
+OBS_MODES = ("metaworld", "canonical")
 
 
 class State(struct.PyTreeNode):
@@ -35,7 +37,8 @@ class State(struct.PyTreeNode):
     physics: Any  # of the backend, with `placement` (3,)
     task_id: jax.Array  # () int32, index into `tasks.TASKS`
     frame: jax.Array  # (18,) last frame, the second half of the next observation
-    obs: jax.Array  # (39,) frame, previous frame, goal (zeros when hidden)
+    obs: jax.Array  # (39,) frame, previous frame, goal (zeros when hidden), in the mode chosen
+    origin: jax.Array  # (3,) object's position in the reset observation, metres in the world
     reward: jax.Array  # () in [0, 10]
     success: jax.Array  # () bool, at this very step
     distance: jax.Array  # () metres between object and target, the quantity success is judged by
@@ -70,15 +73,23 @@ class Ml4Env:
     Args:
         goal_observable: show the target in the last three observation numbers.
         physics: backend, one of `physics.BACKENDS`.
+        obs_mode: `metaworld`, or `canonical`, see `canonical_obs`.
 
     Raises:
-        ValueError: unknown backend.
+        ValueError: unknown backend or observation mode.
     """
 
     observation_size = OBS_SIZE
     action_size = ACTION_SIZE
 
-    def __init__(self, goal_observable: bool = False, physics: str = "mjx"):
+    def __init__(
+        self, goal_observable: bool = False, physics: str = "mjx", obs_mode: str = "metaworld"
+    ):
+        if obs_mode not in OBS_MODES:
+            raise ValueError(
+                f"unknown observation mode '{obs_mode}'\nvalid: {', '.join(OBS_MODES)}"
+            )
+        self.obs_mode = obs_mode
         self.physics: Physics = make_physics(physics)
         self.goal_observable = goal_observable
         self.tasks = _TaskData()
@@ -98,12 +109,14 @@ class Ml4Env:
         shown = physics.placement + fixture.offset + fixture.axis * tasks.first_obs_slide[task_id]
         frame = self._frame(tasks.hand[task_id], tasks.opening[task_id], shown, task_id)
         goal = self._target(physics, task_id) * float(self.goal_observable)
+        obs, origin = jnp.concatenate([frame, frame, goal]), frame[OBJECT]
         zero = jnp.zeros(())
         return State(
             physics=physics,
             task_id=task_id,
             frame=frame,
-            obs=jnp.concatenate([frame, frame, goal]),
+            obs=self._in_mode(obs, origin),
+            origin=origin,
             reward=zero,
             success=jnp.zeros((), bool),
             distance=zero,
@@ -149,12 +162,17 @@ class Ml4Env:
         return state.replace(
             physics=physics,
             frame=frame,
-            obs=obs,
+            obs=self._in_mode(obs, state.origin),
             reward=pick(0),
             distance=pick(1),
             success=pick(2),
             steps=state.steps + 1,
         )
+
+    def _in_mode(self, obs: jax.Array, origin: jax.Array) -> jax.Array:
+        if self.obs_mode == "metaworld":
+            return obs
+        return canonical_obs(obs, origin, self.goal_observable)
 
     def _target(self, physics: Any, task_id: jax.Array) -> jax.Array:
         return physics.placement + self.tasks.target[task_id]
@@ -166,6 +184,23 @@ class Ml4Env:
         quaternion = jnp.array([1.0, 0.0, 0.0, 0.0]) * self.tasks.has_quaternion[task_id]
         handle = fixture + self.tasks.handle[task_id]
         return jnp.concatenate([hand, opening[None], handle, quaternion, jnp.zeros(7)])
+
+
+def canonical_obs(obs: jax.Array, origin: jax.Array, goal_observable: bool = False) -> jax.Array:
+    """An observation that tells less of which task it is: seen from where the object began.
+
+    Hand and object of both frames (and the goal, where it is shown) are relative to the object's
+    position in the reset observation; the quaternion, which drawer-open alone shows, is zero.
+
+    Args:
+        obs: (..., 39) as Meta-World's; origin: (..., 3).
+    """
+    for start in (0, FRAME):
+        for part in (HAND, OBJECT):
+            place = slice(start + part.start, start + part.stop)
+            obs = obs.at[..., place].add(-origin)
+        obs = obs.at[..., start + QUATERNION.start : start + QUATERNION.stop].set(0.0)
+    return obs.at[..., 2 * FRAME :].add(-origin) if goal_observable else obs
 
 
 def _clip_hand(frame: jax.Array) -> jax.Array:

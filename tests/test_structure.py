@@ -25,7 +25,7 @@ ROWS = (
     {"trainer", "evaluate_cli", "bench", "plots"},
     {"session", "bench_physics", "checkpoint", "metrics"},
     {"collect", "evaluate"},
-    {"rollout"},
+    {"rollout", "diagnostics"},
     {"learner"},
     {"losses", "objectives", "context", "replay"},
     {"networks", "layers", "distributions", "normalizers", "goals", "run_dir", "config_io"},

@@ -1,0 +1,96 @@
+"""The committed learning runs, one after another: `python scripts/experiments.py [NAME ...]`.
+
+A run that is finished is left alone, one that was stopped is resumed, so this command can be
+stopped (Ctrl-C, SIGTERM) and given again at any time. Runs go to runs/experiments/NAME; what
+results/ keeps of each (config, versions, thinned metrics, evaluation) is copied to results/NAME.
+`--list` prints the commands. All runs have one budget, BUDGET, but for the single-task ones.
+"""
+
+from __future__ import annotations
+
+import csv
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+RUNS, RESULTS = Path("runs/experiments"), Path("results")
+CSV_ROWS = 100  # kept of a run's metrics
+
+BUDGET = "--env.physics native --train.env_steps 1200000"
+SINGLE = "--config sac.yaml --env.physics native"  # 500,000 env steps
+CMRL = f"--config ml4.yaml {BUDGET}"
+
+EXPERIMENTS = {
+    "cmrl-seed0": CMRL,
+    "cmrl-seed1": f"{CMRL} --seed 1",
+    "mtsac": f"--config mtsac.yaml {BUDGET}",
+    "pearl": f"--config pearl.yaml {BUDGET}",
+    "sac-drawer-close": f"{SINGLE} --tasks.train drawer-close",
+    "sac-window-open": f"{SINGLE} --tasks.train window-open",
+    "sac-window-close": f"{SINGLE} --tasks.train window-close",
+    "sac-drawer-open": f"{SINGLE} --tasks.train drawer-open",
+    "cmrl-holdout-drawer-close": (
+        f"{CMRL} --tasks.train drawer-open,window-open,window-close --tasks.test drawer-close"
+    ),
+    "cmrl-paper": f"--config cmrl-paper.yaml {BUDGET}",
+    "cmrl-no-return-norm": f"{CMRL} --sac.reward_norm none",
+    "cmrl-shared-alpha": f"{CMRL} --sac.alpha shared",
+    "cmrl-no-router": f"{CMRL} --model.net mlp",
+    "cmrl-no-goal": (
+        f"{CMRL} --encoder.goal_fusion none --encoder.p_drop_goal 0 --encoder.p_empty 0"
+        " --collect.group_frac 0.5,0,0.5"
+    ),
+}
+
+
+def command(name: str) -> list[str]:
+    """What a user would type for a run."""
+    run = RUNS / name
+    words = ["train.py", *shlex.split(EXPERIMENTS[name]), "--run", str(run)]
+    return words + (["--resume"] if (run / "config.yaml").exists() else [])
+
+
+def keep(name: str) -> None:
+    """Copies what results/ keeps of a finished run; the metrics thinned to `CSV_ROWS` rows."""
+    run, kept = RUNS / name, RESULTS / name
+    kept.mkdir(parents=True, exist_ok=True)
+    for file in ("config.yaml", "versions.json", "eval.json"):
+        shutil.copy(run / file, kept / file)
+    with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    evaluated = [i for i, column in enumerate(header) if column.startswith("eval/")]
+    stride = -(-len(rows) // CSV_ROWS)
+    thinned = [
+        row
+        for i, row in enumerate(rows)
+        if i % stride == 0 or i == len(rows) - 1 or any(row[c] for c in evaluated)
+    ]
+    with (kept / "metrics.csv").open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([header, *thinned])
+    spoken = f"python {shlex.join(command(name)).removesuffix(' --resume')}\n"
+    (kept / "command.txt").write_text(spoken, encoding="utf-8")
+
+
+def main(words: list[str]) -> int:
+    if "--list" in words:
+        print("\n".join(f"{name}: python {shlex.join(command(name))}" for name in EXPERIMENTS))
+        return 0
+    unknown = [word for word in words if word not in EXPERIMENTS]
+    if unknown:
+        print(f"error: no experiment {unknown[0]}\nfix: choose from {', '.join(EXPERIMENTS)}")
+        return 2
+    for name in words or EXPERIMENTS:
+        if not (RUNS / name / "eval.json").exists():
+            print(f"== {name}", flush=True)
+            code = subprocess.run([sys.executable, *command(name)], cwd=ROOT).returncode
+            if code or not (RUNS / name / "eval.json").exists():
+                return code or 1  # stopped: the next call goes on with it
+        keep(name)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
