@@ -246,11 +246,18 @@ def plot_parser() -> argparse.ArgumentParser:
     """Flags of `plot`."""
     parser = _Parser(
         prog="python train.py plot",
-        description="Draws success per task over env steps from a run's metrics.csv.",
+        description="Draws success, returns and adaptation of runs; seeds of one run as a band.",
         allow_abbrev=False,
     )
-    parser.add_argument("--run", metavar="DIR", type=Path, required=True, help="run directory")
-    parser.add_argument("--out", metavar="F", type=Path, help="picture [DIR/success.png]")
+    parser.add_argument(
+        "--run",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        action="append",
+        help="run directory, again for more runs; DIR-seed0, DIR-seed1 are one band",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="directory [plots/ of the first]")
     return parser
 
 
@@ -259,9 +266,8 @@ def _plot(words: list[str]) -> int:
 
     from cmrl_jax import plots
 
-    out = args.out or args.run / "success.png"
-    plots.plot_success(args.run, out)
-    print(out)
+    for picture in plots.plot_all(args.run, args.out or args.run[0] / "plots"):
+        print(picture)
     return 0
 
 

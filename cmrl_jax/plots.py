@@ -1,12 +1,23 @@
-"""`train.py plot`: figures of runs from their metrics.csv. matplotlib is an extra (`viz`)."""
+"""`train.py plot`: figures of one or more runs. matplotlib is an extra (`viz`).
+
+From metrics.csv: success and return over env steps. From eval.json: the paper's bars and success
+by adaptation episodes. From the last policy checkpoint (`inspection.py`): routing and latents.
+Runs whose directories differ in `-seed<N>` alone are one group: its mean, and a band from the
+lowest to the highest.
+"""
 
 from __future__ import annotations
 
 import csv
+import json
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cmrl_jax.config import ConfigError
+import numpy as np
+
+from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import read_yaml, resolve
 
 Series = list[tuple[float, float]]
@@ -33,12 +44,56 @@ def series(rows: list[dict[str, str]], column: str) -> Series:
     return [(float(row["env_steps"]), float(row[column])) for row in rows if row.get(column)]
 
 
-def plot_success(run: Path, out: Path) -> None:
-    """Success per task over env steps: one panel a task, training episodes and evaluations.
+def group_name(run: Path) -> str:
+    """What runs of several seeds have in common: `cmrl` for runs/cmrl-seed1."""
+    return re.sub(r"-seed\d+$", "", run.resolve().name)
 
-    Raises:
-        ConfigError: matplotlib is not installed, or the run has no figures.
+
+def band(curves: Sequence[Series]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Env steps, and mean, lowest and highest of curves where all have a figure, (point,) each.
+
+    Curves are read at the steps of the shortest, between their own points linearly.
     """
+    shortest = np.array(min(curves, key=lambda c: c[-1][0]))
+    steps = shortest[:, 0]
+    values = np.array([np.interp(steps, *np.array(c).T) for c in curves])
+    return steps, values.mean(0), values.min(0), values.max(0)
+
+
+class Runs:
+    """The runs of a figure: their rows, configurations and evaluations, by group."""
+
+    def __init__(self, runs: Sequence[Path]):
+        self.rows = {run: read_metrics(run) for run in runs}
+        self.configs: dict[Path, Config] = {
+            run: resolve(*read_yaml(run / "config.yaml")) for run in runs
+        }
+        self.groups: dict[str, list[Path]] = {}
+        for run in runs:
+            self.groups.setdefault(group_name(run), []).append(run)
+        self.tasks: list[str] = []
+        for config in self.configs.values():
+            for task in config.tasks.train + config.tasks.test:
+                if task not in self.tasks:
+                    self.tasks.append(task)
+
+    def is_held_out(self, task: str) -> bool:
+        """Whether no run trains on a task."""
+        return not any(task in config.tasks.train for config in self.configs.values())
+
+    def curves(self, group: str, column: str) -> list[Series]:
+        """A column of every run of a group that has it."""
+        found = [series(self.rows[run], column) for run in self.groups[group]]
+        return [curve for curve in found if curve]
+
+    def final(self, group: str, task: str) -> list[dict[str, dict[str, float]]]:
+        """The final evaluation of a task, k -> figures, of every run of a group that has one."""
+        paths = [run / "eval.json" for run in self.groups[group]]
+        read = [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.is_file()]
+        return [result["tasks"][task] for result in read if task in result["tasks"]]
+
+
+def _pyplot() -> Any:
     try:
         import matplotlib
 
@@ -47,32 +102,137 @@ def plot_success(run: Path, out: Path) -> None:
     except ImportError as error:
         cure = "pip install 'cmrl-jax[viz]'"
         raise ConfigError("plot needs matplotlib, which is not installed", cure) from error
-    rows = read_metrics(run)
-    config = resolve(*read_yaml(run / "config.yaml"))
-    tasks = config.tasks.train + config.tasks.test
-    figure, axes = pyplot.subplots(1, len(tasks), figsize=(3.4 * len(tasks), 3.2), sharey=True)
-    panels: list[Any] = [axes] if len(tasks) == 1 else list(axes)
-    for task, axis in zip(tasks, panels, strict=True):
-        for rule, color in (("any", "tab:blue"), ("last", "tab:orange")):
-            points = series(rows, f"train/{task}/success_{rule}")
-            if points:
-                axis.plot(
-                    *zip(*points, strict=True), color=color, lw=1, label=f"training, {rule} step"
-                )
-        for k, marker in zip(config.eval.k, "os^Dv", strict=False):
-            points = series(rows, f"eval/{task}/k{k}/success_any")
-            if points:
-                label = f"evaluation k = {k}, any step"
-                axis.plot(*zip(*points, strict=True), f"k{marker}", ms=4, mfc="none", label=label)
-        axis.set_title(task + ("" if task in config.tasks.train else " (held out)"))
-        axis.set_xlabel("env steps")
-        axis.set_ylim(-0.03, 1.03)
-    panels[0].set_ylabel("success rate")
+    return pyplot
+
+
+def _panels(pyplot: Any, runs: Runs, ylabel: str) -> tuple[Any, dict[str, Any]]:
+    """A figure with one panel a task."""
+    count = len(runs.tasks)
+    figure, axes = pyplot.subplots(1, count, figsize=(3.4 * count, 3.2), sharey=True, squeeze=False)
+    for task, axis in zip(runs.tasks, axes[0], strict=True):
+        axis.set_title(task + (" (held out)" if runs.is_held_out(task) else ""))
+    axes[0, 0].set_ylabel(ylabel)
+    return figure, dict(zip(runs.tasks, axes[0], strict=True))
+
+
+def _finish(pyplot: Any, figure: Any, axes: Sequence[Any], out: Path) -> Path:
+    """One legend for all panels, below them; saved and closed."""
     labelled = {}
-    for axis in panels:
+    for axis in axes:
         handles, labels = axis.get_legend_handles_labels()
         labelled |= dict(zip(labels, handles, strict=True))
-    figure.tight_layout(rect=(0, 0.08, 1, 1))
+    figure.tight_layout(rect=(0, 0.09, 1, 1))
     figure.legend(labelled.values(), labelled.keys(), loc="lower center", ncols=5, fontsize=8)
     figure.savefig(out, dpi=110)
     pyplot.close(figure)
+    return out
+
+
+def _draw_band(axis: Any, curves: Sequence[Series], color: str, style: str, label: str) -> None:
+    if not curves:
+        return
+    steps, mean, low, high = band(curves)
+    axis.plot(steps, mean, color=color, ls=style, lw=1.2, label=label)
+    if len(curves) > 1:
+        axis.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
+
+
+def plot_success(runs: Runs, out: Path) -> Path:
+    """Success over env steps: training episodes at any and last step, evaluations as marks."""
+    pyplot = _pyplot()
+    figure, panels = _panels(pyplot, runs, "success rate")
+    for index, group in enumerate(runs.groups):
+        color = f"C{index}"
+        for task, axis in panels.items():
+            for rule, style in (("any", "-"), ("last", ":")):
+                curves = runs.curves(group, f"train/{task}/success_{rule}")
+                _draw_band(axis, curves, color, style, f"{group}, training, {rule} step")
+            k = max(runs.configs[runs.groups[group][0]].eval.k)
+            label = f"{group}, evaluation k = {k}, any step"
+            for curve in runs.curves(group, f"eval/{task}/k{k}/success_any"):
+                axis.plot(*zip(*curve, strict=True), "o", color=color, ms=4, mfc="w", label=label)
+            axis.set_xlabel("env steps")
+            axis.set_ylim(-0.03, 1.03)
+    return _finish(pyplot, figure, list(panels.values()), out)
+
+
+def plot_returns(runs: Runs, out: Path) -> Path:
+    """Return over env steps (the paper's Figure 5): training episodes, and evaluations of tests."""
+    pyplot = _pyplot()
+    figure, panels = _panels(pyplot, runs, "return")
+    for index, group in enumerate(runs.groups):
+        color = f"C{index}"
+        for task, axis in panels.items():
+            curves = runs.curves(group, f"train/{task}/return")
+            _draw_band(axis, curves, color, "-", f"{group}, training")
+            k = max(runs.configs[runs.groups[group][0]].eval.k)
+            curves = runs.curves(group, f"eval/{task}/k{k}/return")
+            _draw_band(axis, curves, color, "--", f"{group}, evaluation k = {k}")
+            axis.set_xlabel("env steps")
+    return _finish(pyplot, figure, list(panels.values()), out)
+
+
+def plot_bars(runs: Runs, out: Path) -> Path:
+    """Final success per task, groups side by side (the paper's Figure 4); any step, last inside."""
+    pyplot = _pyplot()
+    figure, axis = pyplot.subplots(figsize=(1.8 * len(runs.tasks) + 2, 3.4))
+    width = 0.8 / len(runs.groups)
+    for index, group in enumerate(runs.groups):
+        for place, task in enumerate(runs.tasks):
+            results = runs.final(group, task)
+            if not results:
+                continue
+            k = max(results[0], key=int)
+            x = place + (index - (len(runs.groups) - 1) / 2) * width
+            figures = [[r[k][f"success_{rule}"] for r in results] for rule in ("any", "last")]
+            label = f"{group}, k = {k} (filled: last step)"
+            axis.bar(x, np.mean(figures[0]), 0.9 * width, ec=f"C{index}", fc="none", label=label)
+            axis.bar(x, np.mean(figures[1]), 0.9 * width, color=f"C{index}", alpha=0.45)
+            axis.plot([x] * len(results), figures[0], ".", color="k", ms=4)  # the seeds
+    axis.set_xticks(
+        range(len(runs.tasks)),
+        [t + ("\n(held out)" if runs.is_held_out(t) else "") for t in runs.tasks],
+    )
+    axis.set_ylabel("success rate")
+    axis.set_ylim(0, 1.03)
+    return _finish(pyplot, figure, [axis], out)
+
+
+def plot_k_shot(runs: Runs, out: Path) -> Path:
+    """Final success by number of adaptation episodes."""
+    pyplot = _pyplot()
+    figure, panels = _panels(pyplot, runs, "success rate, any step")
+    for index, group in enumerate(runs.groups):
+        for task, axis in panels.items():
+            curves = [
+                [(float(k), figures["success_any"]) for k, figures in result.items()]
+                for result in runs.final(group, task)
+            ]
+            _draw_band(axis, curves, f"C{index}", "-", group)
+            axis.set_xlabel("adaptation episodes k")
+            axis.set_ylim(-0.03, 1.03)
+    return _finish(pyplot, figure, list(panels.values()), out)
+
+
+def plot_all(runs: Sequence[Path], out: Path) -> list[Path]:
+    """Every figure that the runs' files allow, as PNG in the directory `out`.
+
+    Raises:
+        ConfigError: matplotlib is missing, a run has no figures, or `out` cannot be written.
+    """
+    pyplot, loaded = _pyplot(), Runs(runs)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        drawn = [
+            plot_success(loaded, out / "success.png"),
+            plot_returns(loaded, out / "returns.png"),
+        ]
+        if any(loaded.final(group, task) for group in loaded.groups for task in loaded.tasks):
+            drawn.append(plot_bars(loaded, out / "bars.png"))
+            drawn.append(plot_k_shot(loaded, out / "k_shot.png"))
+    except OSError as error:
+        cause = f"cannot write to {out}: {error.strerror}"
+        raise ConfigError(cause, "give --out a directory you may write to") from error
+    finally:
+        pyplot.close("all")
+    return drawn

@@ -108,7 +108,6 @@ RULES = [
     ("tasks.train=drawer-open,drawer-open", "'drawer-open' stands twice in tasks.train"),
     ("tasks.test=drawer-open", "'drawer-open' is in tasks.train and in tasks.test"),
     ("env.physics=native env.impl=warp", "env.impl warp with env.physics native"),
-    ("env.obs_mode=canonical", "env.obs_mode canonical is not built yet"),
     ("model.critic=hlgauss", "model.critic hlgauss is not built yet"),
     ("model.router_shared=true", "model.router_shared true is not built yet"),
     ("encoder.aux=recon", "encoder.aux recon is not built yet"),
