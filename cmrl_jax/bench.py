@@ -1,8 +1,9 @@
 """`train.py bench`: what this machine does a second, as JSON rows that are flushed one by one.
 
-Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench_physics.py`; here are
-the learner (gradient steps) and the start (seconds from the command to the end of the first
-iteration, with an empty and a filled compilation cache, and peak memory), both of the main job.
+Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench_physics.py` and
+`bench_stages.py`; here are the learner (gradient steps) and the start (seconds from the command to
+the end of the first iteration, with an empty and a filled compilation cache, and peak memory), both
+of the main job.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cmrl_jax import bench_physics
+from cmrl_jax import bench_physics, bench_stages
 from cmrl_jax.bench_physics import best_seconds
 from cmrl_jax.collect import init_run
 from cmrl_jax.config import Config, ConfigError
@@ -128,6 +129,7 @@ def peak_memory_mb(pid: int) -> float:
 
 KINDS = {
     "mjx": lambda config, report: bench_physics.bench_backend("mjx", LANES, report),
+    "stages": lambda config, report: bench_stages.bench_stages(LANES, report),
     "native": lambda config, report: bench_physics.bench_backend("native", LANES, report),
     "rollout": lambda config, report: bench_physics.bench_rollout(report),
     "metaworld": lambda config, report: bench_physics.bench_metaworld(report),

@@ -23,7 +23,7 @@ LIGHT = {"config", "validate", "config_io", "run_dir", "stop", "cli"}
 ROWS = (
     {"cli"},
     {"trainer", "evaluate_cli", "bench", "plots"},
-    {"session", "bench_physics", "checkpoint", "metrics"},
+    {"session", "bench_stages", "bench_physics", "checkpoint", "metrics"},
     {"collect", "evaluate"},
     {"rollout", "diagnostics"},
     {"learner"},
