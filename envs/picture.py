@@ -7,6 +7,7 @@ fixture has made half of its way, so that the hand is at the handle.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -94,6 +95,17 @@ def half_way(task: str) -> tuple[int, np.ndarray, np.ndarray]:
     return step, rollout.qpos[step], placement
 
 
+def _make_directory(path: Path) -> None:
+    """Makes sure that there is a directory to write to; else ValueError (cause, cure)."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        reason = None if os.access(path, os.W_OK) else "permission denied"
+    except OSError as error:
+        reason = error.strerror
+    if reason:
+        raise ValueError(f"cannot write to {path}: {reason}\ngive --out another directory")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Writes drawer.png and window.png; a mistake of the user is two lines and exit code 2."""
     parser = argparse.ArgumentParser(
@@ -106,15 +118,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     out = parser.parse_args(sys.argv[1:] if argv is None else argv).out
     try:
         choose_gl()
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            for scene in SCENES:
-                write_picture(scene, out / f"{scene}.png")
-                print(out / f"{scene}.png")
-        except OSError as error:
-            raise ValueError(
-                f"cannot write to {out}: {error.strerror}\ngive --out a directory you may write to"
-            ) from error
+        _make_directory(out)
+        for scene in SCENES:
+            write_picture(scene, out / f"{scene}.png")
+            print(out / f"{scene}.png")
     except ValueError as error:
         cause, _, cure = str(error).partition("\n")
         if not cure:  # not one of ours

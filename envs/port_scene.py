@@ -6,6 +6,7 @@ part in no contact but the gripper's, is thin capsules along the arm model's bod
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import mujoco
@@ -41,10 +42,11 @@ class Shape(NamedTuple):
     """One convex shape in the world, metres."""
 
     role: str  # a key of COLORS
-    kind: str  # box, capsule (along its z axis) or sphere
+    kind: str  # box, capsule (along its z axis), sphere or hull
     pos: np.ndarray  # (3,)
     rot: np.ndarray  # (3, 3) its axes in columns
-    size: tuple[float, ...]  # half sizes; radius, half length; radius
+    size: tuple[float, ...]  # half sizes; radius, half length; radius; nothing
+    corners: np.ndarray | None = None  # (corner, 3) of a hull, along its own axes
 
 
 def _capsule(role: str, ends: np.ndarray, radius: float) -> Shape:
@@ -67,8 +69,17 @@ def _arm(data: mujoco.MjData) -> list[Shape]:
 
 def _base(gripper: Gripper, pos: np.ndarray, rot: np.ndarray) -> list[Shape]:
     """The gripper base as handles meet it."""
-    ends = pos + gripper.base_ends @ rot.T
-    return [_capsule(BASE, e, r) for e, r in zip(ends, gripper.base_radius, strict=True)]
+    corners = polytope_corners(gripper.base_normal, gripper.base_offset)
+    return [Shape(BASE, "hull", pos, rot, (), corners)]
+
+
+def polytope_corners(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Corners (corner, 3) of {x: normal x <= offset}: where three faces meet and no other cuts."""
+    triples = np.array(list(itertools.combinations(range(len(normal)), 3)))
+    triples = triples[np.abs(np.linalg.det(normal[triples])) > 1e-6]
+    points = np.linalg.solve(normal[triples], offset[triples][..., None])[..., 0]
+    inside = (points @ normal.T <= offset + 1e-9).all(1)
+    return points[inside]
 
 
 def _fingers(gripper: Gripper, pos: np.ndarray, rot: np.ndarray, slides: np.ndarray) -> list[Shape]:
@@ -147,11 +158,15 @@ def to_model(shapes: list[Shape]) -> mujoco.MjModel:
         "box": mujoco.mjtGeom.mjGEOM_BOX,
         "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
         "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+        "hull": mujoco.mjtGeom.mjGEOM_MESH,
     }
-    for shape in shapes:
+    for i, shape in enumerate(shapes):
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, shape.rot.ravel())
+        if shape.corners is not None:
+            spec.add_mesh(name=str(i), uservert=shape.corners.ravel())
         spec.worldbody.add_geom(
+            meshname=str(i) if shape.corners is not None else "",
             type=kinds[shape.kind],
             pos=shape.pos,
             quat=quat,

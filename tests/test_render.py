@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial import HalfspaceIntersection
 
 from envs import port_scene
 from envs.contact import BASE_SLOTS, FINGER_SLOTS, find_contacts
@@ -146,6 +147,16 @@ def test_drawn_shapes_are_as_far_apart_as_contacts_say(states):
                 compared += 1
                 assert abs(got.min() - least) < 2e-4, (task, one)
     assert compared >= 9
+
+
+def test_corners_of_the_gripper_base_are_those_of_its_half_spaces():
+    gripper = load_gripper(load_scene("drawer"))
+    normal, offset = gripper.base_normal, gripper.base_offset
+    ours = port_scene.polytope_corners(normal, offset)
+    inside = ours.mean(0)  # qhull wants a point within
+    theirs = HalfspaceIntersection(np.column_stack([normal, -offset]), inside).intersections
+    apart = np.linalg.norm(ours[:, None] - theirs, axis=2)
+    assert apart.min(0).max() < 1e-6 and apart.min(1).max() < 1e-6
 
 
 # From here on, pictures. MuJoCo takes its GL from the environment when it is imported, so each is
