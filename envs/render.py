@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from types import TracebackType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -33,8 +32,8 @@ class Camera(NamedTuple):
 _CAMERAS = {
     "drawer-open": Camera((-0.05, -0.31, 0.16), 0.92, 140.0, -22.0),
     "drawer-close": Camera((-0.05, -0.31, 0.16), 0.92, 140.0, -22.0),
-    "window-open": Camera((-0.03, -0.2, 0.06), 0.92, 140.0, -20.0),
-    "window-close": Camera((0.03, -0.2, 0.03), 0.92, 40.0, -20.0),
+    "window-open": Camera((-0.03, -0.2, 0.06), 0.92, 145.0, -20.0),
+    "window-close": Camera((0.03, -0.2, 0.06), 0.92, 20.0, -16.0),
 }
 
 
@@ -112,12 +111,11 @@ class Renderer:
     def __enter__(self) -> Renderer:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Lets go of the GL context."""
         self._renderer.close()
 
     def draw(self, qpos: np.ndarray, camera: Camera) -> np.ndarray:

@@ -19,7 +19,7 @@ from envs.geometry import load_gripper, load_shapes
 from envs.model import ARM_JOINTS, LEFT_FINGER, RIGHT_FINGER, SLIDE, load_fixture, load_scene
 from envs.picture import half_way
 from envs.reference import ReferenceEnv
-from envs.render import camera_of, choose_gl, metaworld_scene
+from envs.render import camera_of, metaworld_scene
 from envs.tasks import SPECS, TASKS
 
 ROOT = Path(__file__).parent.parent
@@ -159,8 +159,7 @@ def test_corners_of_the_gripper_base_are_those_of_its_half_spaces():
     assert apart.min(0).max() < 1e-6 and apart.min(1).max() < 1e-6
 
 
-# From here on, pictures. MuJoCo takes its GL from the environment when it is imported, so each is
-# made in a process of its own.
+# From here on, pictures: each in a process of its own (see the fixture `gl`).
 
 
 def python(code, **environment):
@@ -183,24 +182,18 @@ def test_missing_gl_is_two_lines(gl, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory):
-    """Pictures of window-open and drawer-open: Meta-World's and the port's, (height, width, 3)."""
-    try:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))  # put back afterwards
-            choose_gl()
-    except ValueError as error:
-        pytest.skip(str(error).partition("\n")[0])
+def pictures(gl, tmp_path_factory):
+    """Meta-World's and the port's picture of three tasks, (2, height, width, 3)."""
     out = tmp_path_factory.mktemp("pictures") / "pictures.npz"
     done = python(
         [
             "-c",
-            "from envs.render import choose_gl; choose_gl()\n"
             "import sys, numpy as np; from envs.picture import draw_task\n"
             "tasks = 'drawer-open', 'window-open', 'window-close'\n"
             "np.savez(sys.argv[1], **{t: np.stack(draw_task(t)[1:3]) for t in tasks})",
             str(out),
-        ]
+        ],
+        MUJOCO_GL=gl,
     )
     assert done.returncode == 0, done.stderr
     return dict(np.load(out))
