@@ -1,4 +1,4 @@
-"""Command line: `train` (the default), `eval`, `plot` and `bench`.
+"""Command line: `train` (the default), `eval`, `plot`, `bench` and `render`.
 
 A user's mistake is one line of cause, one of cure and exit code 2, before jax is imported; any
 other exception keeps its traceback. jax and mujoco are imported by the commands alone, so that
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
+from cmrl_jax import render_flags
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
 from cmrl_jax.config_io import (
     check_resumable,
@@ -29,9 +30,9 @@ from cmrl_jax.run_dir import config_stem, find_run, new_run, resumed_run
 from cmrl_jax.stop import StopSignal
 from cmrl_jax.validate import check_goal_set
 
-COMMANDS = ("train", "eval", "plot", "bench")
+COMMANDS = ("train", "eval", "plot", "bench", "render")
 # Commands and options of the design whose code is not there yet: refused by name.
-NOT_BUILT = ("sweep", "finetune", "render", "goals")
+NOT_BUILT = ("sweep", "finetune", "goals")
 EVAL_NOT_BUILT = {"z": ("prior", "shuffled", "other", "text"), "physics": ("metaworld",)}
 
 
@@ -64,7 +65,8 @@ def _dispatch(words: list[str]) -> int:
         near = suggest(command, COMMANDS)
         cure = f"{near}commands: {', '.join(COMMANDS)}; train needs --config ml4.yaml"
         raise ConfigError(f"unknown command '{command}'", cure)
-    return {"train": _train, "eval": _eval, "plot": _plot, "bench": _bench}[command](words)
+    run = {"train": _train, "eval": _eval, "plot": _plot, "bench": _bench, "render": _render}
+    return run[command](words)
 
 
 def _parse(parser: argparse.ArgumentParser, words: list[str]) -> argparse.Namespace:
@@ -293,6 +295,23 @@ def _bench(words: list[str]) -> int:
 
     rows = tuple(row.strip() for row in args.rows.split(",") if row.strip())
     return bench.main(json_path=args.json, rows=rows)
+
+
+def _render(words: list[str]) -> int:
+    parser = _Parser(
+        prog="python train.py render", description=render_flags.DESCRIPTION, allow_abbrev=False
+    )
+    options = render_flags.options_of(_parse(render_flags.add_flags(parser), words))
+
+    from envs.render import choose_gl
+
+    try:
+        choose_gl()  # before anything imports mujoco
+    except ValueError as error:
+        raise ConfigError(*str(error).split("\n")) from error
+    from cmrl_jax import render
+
+    return render.render_run(**options)
 
 
 def _writable(path: Path | None) -> None:

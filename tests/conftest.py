@@ -49,3 +49,21 @@ def rollouts():
     from env_fixtures import record
 
     return record()
+
+
+@pytest.fixture(scope="session")
+def gl():
+    """Value of MUJOCO_GL for a process that draws; skips where no GL library can be had.
+
+    MuJoCo takes its GL from the environment when it is imported, so pictures need processes of
+    their own.
+    """
+    from envs.render import choose_gl
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))  # put back afterwards
+        try:
+            choose_gl()
+        except ValueError as error:
+            pytest.skip(str(error).partition("\n")[0])
+        return os.environ["MUJOCO_GL"]

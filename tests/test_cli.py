@@ -168,6 +168,11 @@ def test_missing_extra(refused, monkeypatch):
         (["eval", "--run", "x", "--z", "no"], "--z: invalid choice", "--help"),
         (["eval", "--run", "x", "--physics", "metaworld"], "--physics metaworld is not", "leave"),
         (["eval", "--run", "x", "--text", "shut it"], "--text is not built yet", "leave"),
+        (["render", "--run", "nope"], "run directory nope does not exist", "train"),
+        (["render", "--run", "x", "--k", "-1"], "--k is -1", "0 or more"),
+        (["render", "--run", "x", "--every", "0"], "--every is 0", "1 or more"),
+        (["render", "--run", "x", "--goal", "50"], "--goal is 50", "0 to 49"),
+        (["render", "--run", "x", "--goal-set", "trian"], "'trian'", "did you mean 'train'?"),
         (["bench", "--jsn", "x"], "unknown argument '--jsn'", "'--json'?"),
         (["bench", "--json", "/dev/null/x"], "cannot write /dev/null/x", "--json"),
     ],
@@ -229,7 +234,7 @@ def test_help_and_mistakes_import_neither_jax_nor_mujoco():
     script = """
 import sys
 from cmrl_jax.cli import main
-for command in ([], ["eval"], ["bench"]):
+for command in ([], ["eval"], ["bench"], ["render"]):
     try:
         main([*command, "--help"])
     except SystemExit as stop:
@@ -240,7 +245,7 @@ print(sorted({"jax", "mujoco", "flax", "numpy", "transformers"} & set(sys.module
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]"
-    for text in ("--collect.lanes N", "--goal-set SET", "--rows A,B", "[96]"):
+    for text in ("--collect.lanes N", "--goal-set SET", "--rows A,B", "[96]", "--every N"):
         assert text in done.stdout
 
 
