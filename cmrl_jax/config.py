@@ -48,7 +48,7 @@ class EnvConfig:
     physics: Literal["mjx", "native"] = doc(
         "mjx", "mjx: on the device; native: MuJoCo C on the host, Meta-World's own contacts"
     )
-    impl: Literal["jax", "warp"] = doc("jax", "MJX implementation; warp needs CUDA")
+    impl: Literal["jax", "warp"] = doc("jax", "MJX implementation")
     horizon: int = doc(
         200, "control steps an episode lasts; a time limit, never a terminal", above=0
     )

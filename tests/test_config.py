@@ -107,7 +107,7 @@ RULES = [
     ("tasks.train=", "tasks.train is empty"),
     ("tasks.train=drawer-open,drawer-open", "'drawer-open' stands twice in tasks.train"),
     ("tasks.test=drawer-open", "'drawer-open' is in tasks.train and in tasks.test"),
-    ("env.physics=native env.impl=warp", "env.impl warp with env.physics native"),
+    ("env.impl=warp", "env.impl warp is not built yet"),
     ("model.critic=hlgauss", "model.critic hlgauss is not built yet"),
     ("model.router_shared=true", "model.router_shared true is not built yet"),
     ("encoder.aux=recon", "encoder.aux recon is not built yet"),
