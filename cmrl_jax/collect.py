@@ -70,6 +70,7 @@ def make_train_iteration(
     learner: Learner,
     goal_vectors: jax.Array,
     placements: jax.Array | None,
+    freeze_statistics: bool = False,
 ) -> TrainIteration:
     """Builds the iteration of a validated configuration.
 
@@ -77,6 +78,7 @@ def make_train_iteration(
         goal_vectors: text vectors of the training tasks (task, paraphrase, G).
         placements: fixture placements (task, goal, 3) to draw from at a reset
             (`env.variation: fixed_50`); None draws from Meta-World's reset box.
+        freeze_statistics: keep the statistics of observations and returns as they are.
 
     Returns:
         (RunState) -> RunState, metrics. Iteration 0 makes no gradient step, and its losses are NaN.
@@ -191,18 +193,23 @@ def make_train_iteration(
 
     def store(run: RunState, transitions: Transition) -> RunState:
         """A chunk (time, task, lane, ...) into rings and running statistics."""
-        state = replace(
-            run.learner,
-            obs_stats=normalizers.update_obs_stats(run.learner.obs_stats, transitions.obs),
-            return_stats=normalizers.update_return_stats(
-                run.learner.return_stats, transitions.reward, transitions.first, config.sac.gamma
-            ),
-        )
+        state = run.learner
+        if not freeze_statistics:
+            state = with_statistics(state, transitions)
         eligible = jax.tree.map(lambda x: x[:, :, :writers], transitions)
         return run.replace(
             learner=state,
             replay=rings.add(run.replay, transitions),
             context=rings.add_context(run.context, eligible),
+        )
+
+    def with_statistics(state: TrainState, transitions: Transition) -> TrainState:
+        return replace(
+            state,
+            obs_stats=normalizers.update_obs_stats(state.obs_stats, transitions.obs),
+            return_stats=normalizers.update_return_stats(
+                state.return_stats, transitions.reward, transitions.first, config.sac.gamma
+            ),
         )
 
     return train_iteration

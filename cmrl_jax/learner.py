@@ -101,12 +101,18 @@ def per_task(rows: jax.Array, task_ids: jax.Array, num_tasks: int) -> jax.Array:
 
 
 def make_learner(
-    cfg: Config, goal_vectors: jax.Array, obs_size: int = 39, action_size: int = 4
+    cfg: Config,
+    goal_vectors: jax.Array,
+    obs_size: int = 39,
+    action_size: int = 4,
+    inference: ContextInference | None = None,
 ) -> Learner:
     """Builds the learner of a validated configuration.
 
     Args:
         goal_vectors: text vectors of the training tasks, float32 (T, paraphrase, G).
+        inference: in place of the encoder's own, for parameters that the caller puts into
+            `encoder_params`.
 
     Raises:
         ValueError: `goal_vectors` does not fit `tasks.train`.
@@ -120,7 +126,8 @@ def make_learner(
         )
     networks = make_networks(cfg, obs_size, action_size, goal_vectors.shape[-1], num_tasks)
     has_encoder = cfg.model.conditioning == "z"
-    inference = make_context_inference(cfg, networks) if has_encoder else None
+    if inference is None and has_encoder:
+        inference = make_context_inference(cfg, networks)
     objectives = make_objectives(cfg, networks, inference, action_size)
     has_value = sac.variant == "v"
     latent_dim = inference.latent_dim if inference else 0
