@@ -312,5 +312,5 @@ def find_contacts(
 
 def _without_torsion(contacts: Contacts) -> Contacts:
     """Contacts that do not resist spinning about their normal (MuJoCo's condim 3)."""
-    friction = contacts.material.friction.at[:, 1].set(0.0)
+    friction = jnp.asarray(contacts.material.friction).at[:, 1].set(0.0)
     return contacts._replace(material=contacts.material._replace(friction=friction))
