@@ -22,7 +22,7 @@ from cmrl_jax.config import Config, lane_groups, lanes_per_task
 from cmrl_jax.diagnostics import make_diagnose
 from cmrl_jax.learner import Learner, TrainState
 from cmrl_jax.replay import ContextState, ReplayState, Transition
-from cmrl_jax.rollout import rollout
+from cmrl_jax.rollout import correlated_noise, rollout
 from envs.sawyer import ACTION_SIZE, OBS_SIZE, Ml4Env, State
 from envs.tasks import task_id
 
@@ -153,11 +153,16 @@ def make_train_iteration(
     def train_iteration(run: RunState) -> tuple[RunState, dict[str, jax.Array]]:
         is_first = run.iteration == 0
         random_actions = is_first & (collect.initial == "random")
-        k_z, k_reset, k_chunks, k_diagnose, key = jax.random.split(run.key, 5)
+        k_z, k_reset, k_noise, k_chunks, k_diagnose, key = jax.random.split(run.key, 6)
         zc, actual_source = draw_conditioning(run, k_z)
 
-        def chunk(carry: tuple[RunState, State], key: jax.Array):
+        noise = correlated_noise(
+            k_noise, horizon, (lanes, ACTION_SIZE), collect.noise_correlation
+        ).reshape(-1, collect.chunk, lanes, ACTION_SIZE)
+
+        def chunk(carry: tuple[RunState, State], inputs: tuple[jax.Array, jax.Array]):
             run, state = carry
+            key, chunk_noise = inputs
             k_act, k_update = jax.random.split(key)
             state, transitions, stats = rollout(
                 env,
@@ -169,6 +174,7 @@ def make_train_iteration(
                 collect.chunk,
                 horizon,
                 random_actions=random_actions,
+                noise=chunk_noise,
             )
             run = store(run, jax.tree.map(by_task, transitions))
             run, metrics = jax.lax.cond(is_first, skip_steps, train_steps, run, k_update)
@@ -177,7 +183,7 @@ def make_train_iteration(
         run = run.replace(key=key)
         keys = jax.random.split(k_chunks, horizon // collect.chunk)
         (run, state), (metrics, reward, stats) = jax.lax.scan(
-            chunk, (run, reset_lanes(k_reset)), keys
+            chunk, (run, reset_lanes(k_reset)), (keys, noise)
         )
         metrics = {name: jnp.mean(value, 0) for name, value in metrics.items()}
         flat = lambda x: by_task(x.reshape(horizon, lanes))  # (time, task, lane)
