@@ -91,6 +91,10 @@ def make_train_iteration(
     train_task = jnp.repeat(jnp.arange(num_tasks), per_task)  # (lane,) row of the rings
     groups = lane_groups(config)
     source = np.tile(np.repeat(np.arange(3), groups), num_tasks)  # (lane,) index of Z_SOURCES
+    # Dealt out so that each group of a task has the whole range of scales.
+    scale = np.geomspace(1.0, collect.noise_scale, per_task)
+    shuffled = np.random.default_rng(0).permutation(per_task)
+    lane_scale = jnp.asarray(np.tile(scale[shuffled], num_tasks), jnp.float32)  # (lane,)
     writers = groups[0] if collect.context_lanes == "prior" else per_task
     inference = learner.inference
     diagnose = make_diagnose(config, learner, goal_vectors)
@@ -156,9 +160,10 @@ def make_train_iteration(
         k_z, k_reset, k_noise, k_chunks, k_diagnose, key = jax.random.split(run.key, 6)
         zc, actual_source = draw_conditioning(run, k_z)
 
-        noise = correlated_noise(
+        noise = lane_scale[:, None] * correlated_noise(
             k_noise, horizon, (lanes, ACTION_SIZE), collect.noise_correlation
-        ).reshape(-1, collect.chunk, lanes, ACTION_SIZE)
+        )
+        noise = noise.reshape(-1, collect.chunk, lanes, ACTION_SIZE)
 
         def chunk(carry: tuple[RunState, State], inputs: tuple[jax.Array, jax.Array]):
             run, state = carry
@@ -206,7 +211,7 @@ def make_train_iteration(
         return run.replace(
             learner=state,
             replay=rings.add(run.replay, transitions),
-            context=rings.add_context(run.context, eligible),
+            context=rings.add(run.context, eligible),
         )
 
     def with_statistics(state: TrainState, transitions: Transition) -> TrainState:

@@ -152,6 +152,11 @@ class CollectConfig:
     noise_correlation: float = doc(
         0.0, "correlation of a lane's exploration noise from one step to the next", high=0.999
     )
+    noise_scale: float = doc(
+        1.0,
+        "exploration noise of a task's lanes: from the policy's own to this many times it",
+        low=1,
+    )
     initial: Literal["random", "prior"] = doc("random", "actions of iteration 0")
     context_source: Literal["recent", "all"] = doc("recent", "context from last episodes, or all")
     context_episodes: int = doc(2, "episodes a lane that the recent context ring holds", above=0)

@@ -207,7 +207,7 @@ def make_learner(
         if cfg.collect.context_source == "all":
             context = replay.sample_transitions(replay_state, k_context, task_ids, n_max)
         else:
-            context = replay.sample_context(context_state, k_context, task_ids, n_max)
+            context = replay.sample_transitions(context_state, k_context, task_ids, n_max)
         u_length, u_empty, u_goal, u_text = jax.random.uniform(k_uniform, (4, rows))
         paraphrase = (u_text * goal_vectors.shape[1]).astype(jnp.int32)
         return data._replace(
