@@ -1,4 +1,4 @@
-"""Command line: `train` (the default), `eval`, `plot`, `bench` and `render`.
+"""Command line: `train` (the default), `eval`, `plot`, `bench`, `render` and `goals`.
 
 A user's mistake is one line of cause, one of cure and exit code 2, before jax is imported; any
 other exception keeps its traceback. jax and mujoco are imported by the commands alone, so that
@@ -26,13 +26,14 @@ from cmrl_jax.config_io import (
     resolve,
     to_yaml,
 )
+from cmrl_jax.goal_files import find_table
 from cmrl_jax.run_dir import config_stem, find_run, new_run, resumed_run
 from cmrl_jax.stop import StopSignal
 from cmrl_jax.validate import check_goal_set
 
-COMMANDS = ("train", "eval", "plot", "bench", "render")
+COMMANDS = ("train", "eval", "plot", "bench", "render", "goals")
 # Commands and options of the design whose code is not there yet: refused by name.
-NOT_BUILT = ("sweep", "finetune", "goals")
+NOT_BUILT = ("sweep", "finetune")
 EVAL_NOT_BUILT = {"z": ("prior", "shuffled", "other", "text"), "physics": ("metaworld",)}
 
 
@@ -65,7 +66,14 @@ def _dispatch(words: list[str]) -> int:
         near = suggest(command, COMMANDS)
         cure = f"{near}commands: {', '.join(COMMANDS)}; train needs --config ml4.yaml"
         raise ConfigError(f"unknown command '{command}'", cure)
-    run = {"train": _train, "eval": _eval, "plot": _plot, "bench": _bench, "render": _render}
+    run = {
+        "train": _train,
+        "eval": _eval,
+        "plot": _plot,
+        "bench": _bench,
+        "render": _render,
+        "goals": _goals,
+    }
     return run[command](words)
 
 
@@ -153,6 +161,7 @@ def _train(words: list[str]) -> int:
 
 
 def _check_extras(config: Config) -> None:
+    find_table(config.goals.table)
     if config.log.tensorboard and importlib.util.find_spec("tensorboardX") is None:
         cause = "log.tensorboard needs the package tensorboardX, which is not installed"
         raise ConfigError(cause, "pip install 'cmrl-jax[viz]', or set log.tensorboard: false")
@@ -312,6 +321,16 @@ def _render(words: list[str]) -> int:
     from cmrl_jax import render
 
     return render.render_run(**options)
+
+
+def _goals(words: list[str]) -> int:
+    from cmrl_jax import goals_cli
+
+    parser = _Parser(
+        prog="python train.py goals", description=goals_cli.DESCRIPTION, allow_abbrev=False
+    )
+    goals_cli.add_flags(parser)
+    return goals_cli.run(_parse(parser, words))
 
 
 def _writable(path: Path | None) -> None:

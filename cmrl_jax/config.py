@@ -15,6 +15,8 @@ from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
+TEXT_ENCODERS = ("minilm-l6-v2", "clip-vit-b-32")  # the table of the first is packaged
+GOAL_ABLATIONS = ("one-hot", "zero", "shuffled")
 
 
 class ConfigError(ValueError):
@@ -63,8 +65,10 @@ class EnvConfig:
 
 @dataclass(frozen=True)
 class GoalsConfig:
-    table: Literal["minilm-l6-v2", "one-hot", "zero"] = doc(
-        "minilm-l6-v2", "text vectors of the goals; one-hot and zero are ablations"
+    table: str = doc(
+        "minilm-l6-v2",
+        "text vectors: minilm-l6-v2, clip-vit-b-32 (once built) or the path of an .npz; "
+        "one-hot, zero and shuffled are ablations",
     )
 
 

@@ -1,6 +1,6 @@
-"""Text goals as constants: a packaged table of sentence vectors, and two ablations of it.
+"""Text goals as constants: a table of sentence vectors, and three ablations of the packaged one.
 
-The training loop only ever sees the arrays. `build_goals.py` makes the table; nothing here needs
+The training loop only ever sees the arrays. `goal_builder.py` makes the table; nothing here needs
 an encoder.
 """
 
@@ -16,12 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cmrl_jax.config import TASKS, ConfigError
-
-_DATA = Path(__file__).parent / "data"
-PROMPTS_FILE = _DATA / "goal_prompts.yaml"
-DEFAULT_TABLE = "minilm-l6-v2"
-ABLATIONS = ("one-hot", "zero")
+from cmrl_jax.config import GOAL_ABLATIONS, TASKS, ConfigError
+from cmrl_jax.goal_files import BUILD, find_table
 
 
 @dataclass(frozen=True)
@@ -71,18 +67,15 @@ class GoalTable:
         )
 
 
-def table_path(name: str) -> Path:
-    """Returns where the packaged table of encoder `name` lies, whether or not it exists."""
-    return _DATA / f"goals-{name}.npz"
-
-
-def load_goals(table: str, tasks: tuple[str, ...]) -> GoalTable:
+def load_goals(table: str, tasks: tuple[str, ...] = TASKS) -> GoalTable:
     """Returns the goal vectors of `tasks`.
 
     Args:
-        table: an encoder whose table is packaged, or an ablation: `one-hot` says which task it is
-            and nothing else (G = 4, the same row for a task whatever the others are); `zero` is the
-            default table with every vector 0, so shapes and sentences stay.
+        table: an encoder whose table is packaged or was built, the path of an .npz, or an ablation:
+            `one-hot` says which task it is and nothing else (G = 4, the same row for a task
+            whatever the others are); `zero` is the default table with every vector 0, so shapes
+            and sentences stay; `shuffled` is the default table with another task's sentences for
+            each task.
         tasks: task names, the order of the arrays' first axis.
 
     Raises:
@@ -94,35 +87,45 @@ def load_goals(table: str, tasks: tuple[str, ...]) -> GoalTable:
         return _ablation(
             GoalTable(TASKS, eye, eye, names, names, encoder=table, revision="", sha256="")
         ).select(tasks)
+    text = read_table(find_table(table))
     if table == "zero":
-        text = read_table(table_path(DEFAULT_TABLE))
-        return _ablation(
-            replace(
-                text,
-                vectors=np.zeros_like(text.vectors),
-                heldout_vectors=np.zeros_like(text.heldout_vectors),
-                encoder=table,
-                revision="",
-            )
-        ).select(tasks)
-    packaged = sorted(path.stem.removeprefix("goals-") for path in _DATA.glob("goals-*.npz"))
-    if table not in packaged:
-        valid = (*packaged, *ABLATIONS)
-        raise ConfigError(
-            f"there is no goal table {table!r}{_meant(table, valid)}",
-            f"use one of {', '.join(valid)}, or build one: "
-            f"python -m cmrl_jax.build_goals --encoder {table}",
+        text = replace(
+            text,
+            vectors=np.zeros_like(text.vectors),
+            heldout_vectors=np.zeros_like(text.heldout_vectors),
         )
-    return read_table(table_path(table)).select(tasks)
+    elif table == "shuffled":
+        # Each task takes the next one's: open-drawer words for window-close. No task keeps its own,
+        # and unlike a swap of verbs or of objects it breaks what two tasks on one object share.
+        rows = np.roll(np.arange(len(text.tasks)), -1)
+        text = replace(text.select([text.tasks[row] for row in rows]), tasks=text.tasks)
+    if table in GOAL_ABLATIONS:
+        text = _ablation(replace(text, encoder=table, revision=""))
+    return text.select(tasks)
+
+
+def check_same_table(table: GoalTable, recorded_sha256: str, run: Path, cure: str = "") -> None:
+    """Raises ConfigError unless `table` is the one that a run was trained with.
+
+    Args:
+        recorded_sha256: `goals_sha256` of the run's checkpoints.
+        cure: what to do about it, where putting the table back is not all.
+    """
+    if table.sha256 != recorded_sha256:
+        raise ConfigError(
+            f"{run} was trained with another goal table ({recorded_sha256[:12]}) than "
+            f"{table.encoder} is now ({table.sha256[:12]})",
+            cure or "put that table back, or start a new run",
+        )
 
 
 def read_table(path: Path) -> GoalTable:
-    """Reads a table that `build_goals` wrote, with all its tasks.
+    """Reads a table that `goal_builder` wrote, with all its tasks.
 
     Raises:
         ConfigError: missing, corrupt or inconsistent file.
     """
-    cure = "restore the file (git checkout) or build it: python -m cmrl_jax.build_goals --help"
+    cure = f"restore the file, or build it: {BUILD} --help"
     try:
         content = path.read_bytes()
         with np.load(io.BytesIO(content), allow_pickle=False) as data:

@@ -28,6 +28,7 @@ from cmrl_jax.collect import (
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import to_yaml
 from cmrl_jax.evaluate import format_scores, summarise
+from cmrl_jax.goals import check_same_table
 from cmrl_jax.metrics import (
     LEADING_COLUMNS,
     Console,
@@ -147,7 +148,7 @@ class _Run:
             trees, meta = self.full.restore(
                 self.trees(abstract), config=config, versions=package_versions()
             )
-            self.check_goals(meta)
+            check_same_table(self.session.goals, meta["goals_sha256"], self.run_dir)
             learner = trees["learner"]
             self.state = RunState(
                 learner=learner["state"],
@@ -174,13 +175,6 @@ class _Run:
         self.evaluator = self.session.evaluator()
         self.clock = time.monotonic() - self.wall
         self.save()
-
-    def check_goals(self, meta: dict[str, Any]) -> None:
-        if meta["goals_sha256"] != self.session.goals.sha256:
-            raise ConfigError(
-                f"{self.run_dir} was trained with another goal table ({meta['goals_sha256'][:12]})",
-                "put that table back, or start a new run",
-            )
 
     def timed(self, what: str, compile: Callable[[], Any]) -> Any:
         """Announces a compile and says how long it took."""

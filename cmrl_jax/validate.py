@@ -7,7 +7,9 @@ anything is compiled, and import neither jax nor mujoco.
 from __future__ import annotations
 
 from cmrl_jax.config import (
+    GOAL_ABLATIONS,
     TASKS,
+    TEXT_ENCODERS,
     Config,
     ConfigError,
     lane_groups,
@@ -42,6 +44,7 @@ def validate(config: Config) -> None:
             default = str(f.default).lower() if isinstance(f.default, bool) else f.default
             raise ConfigError(f"{name} {shown} is not built yet", f"use {name}: {default}")
     _check_tasks(config)
+    check_goal_table(config.goals.table)
     _check_model(config)
     _check_sizes(config)
     _check_eval(config)
@@ -141,6 +144,16 @@ def _check_sizes(config: Config) -> None:
     _require(capacity % lanes == 0, cause, f"set train.capacity: {-(-capacity // lanes) * lanes}")
     cause = "train.env_steps and train.minutes are both 0: the run would never end"
     _require(bool(config.train.env_steps or config.train.minutes), cause, "set one of them")
+
+
+def check_goal_table(table: str) -> None:
+    """Raises ConfigError unless `table` is an encoder, an ablation or the path of an .npz."""
+    valid = (*TEXT_ENCODERS, *GOAL_ABLATIONS)
+    _require(
+        table in valid or table.endswith(".npz"),
+        f"'{table}' (goals.table) is no goal table",
+        f"{suggest(table, valid)}valid: {', '.join(valid)}, or the path of an .npz",
+    )
 
 
 def check_goal_set(name: str, key: str) -> None:

@@ -146,7 +146,9 @@ def test_missing_extra(refused, monkeypatch):
             "the command 'sweep' is not built yet",
             "train, eval, plot, bench",
         ),
-        (["goals"], "the command 'goals' is not built yet", "train, eval, plot, bench"),
+        (["goals", "--shwo"], "unknown argument '--shwo'", "'--show'?"),
+        (["goals", "--encoder", "clip"], "unknown encoder 'clip'", "clip-vit-b-32"),
+        (["goals", "--show", "--encoder", "zeor"], "'zeor' (goals.table)", "did you mean 'zero'?"),
         (["--config", "ml4.yaml", "--sac.rl", "1"], "unknown argument '--sac.rl'", "'--sac.lr'?"),
         (["--config", "ml4.yaml", "--sac.rl=1"], "unknown argument '--sac.rl'", "'--sac.lr'?"),
         (["--config", "ml4.yaml", "--sac", "1"], "unknown argument '--sac'", "--help"),
@@ -234,7 +236,7 @@ def test_help_and_mistakes_import_neither_jax_nor_mujoco():
     script = """
 import sys
 from cmrl_jax.cli import main
-for command in ([], ["eval"], ["bench"], ["render"]):
+for command in ([], ["eval"], ["bench"], ["render"], ["goals"]):
     try:
         main([*command, "--help"])
     except SystemExit as stop:
@@ -245,7 +247,15 @@ print(sorted({"jax", "mujoco", "flax", "numpy", "transformers"} & set(sys.module
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]"
-    for text in ("--collect.lanes N", "--goal-set SET", "--rows A,B", "[96]", "--every N"):
+    texts = (
+        "--collect.lanes N",
+        "--goal-set SET",
+        "--rows A,B",
+        "--every N",
+        "--weights DIR",
+        "[96]",
+    )
+    for text in texts:
         assert text in done.stdout
 
 

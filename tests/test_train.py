@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cmrl_jax import goal_files
 from cmrl_jax.checkpoint import full_store, policy_store
 from cmrl_jax.cli import main
 from cmrl_jax.collect import init_run, make_train_iteration
@@ -143,6 +144,17 @@ def test_a_run_killed_before_its_first_save_resumes_from_the_start(finished, tmp
 def test_resume_refuses_a_changed_field_by_name(finished, refused):
     cause, cure = refused("--run", str(finished[0]), "--resume", "--sac.gamma", "0.9")
     assert "sac.gamma" in cause and cure
+
+
+def test_resume_refuses_another_goal_table(finished, tmp_path, monkeypatch, capsys):
+    """The table of that name was made anew: same sentences, another release of the encoder."""
+    with np.load(goal_files.table_path("minilm-l6-v2")) as data:
+        np.savez(tmp_path / "goals-minilm-l6-v2.npz", **{**data, "revision": np.array("other")})
+    monkeypatch.setattr(goal_files, "DATA", tmp_path)
+    before = rows_of(finished[0])
+    assert main(["--run", str(finished[0]), "--resume", "--train.env_steps", "9000"]) == 2
+    assert "was trained with another goal table" in capsys.readouterr().err
+    assert rows_of(finished[0]) == before
 
 
 def run_and_signal(run, marker, *words, **environment):
