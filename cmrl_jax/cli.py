@@ -1,4 +1,4 @@
-"""Command line: `train` (the default), `eval`, `plot`, `bench`, `render` and `goals`.
+"""Command line: `train` (the default) and the commands in `COMMANDS`.
 
 A user's mistake is one line of cause, one of cure and exit code 2, before jax is imported; any
 other exception keeps its traceback. jax and mujoco are imported by the commands alone, so that
@@ -13,9 +13,9 @@ import sys
 import typing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
-from cmrl_jax import render_flags
+from cmrl_jax import evaluate_flags, finetune_flags, render_flags
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
 from cmrl_jax.config_io import (
     check_resumable,
@@ -26,22 +26,12 @@ from cmrl_jax.config_io import (
     resolve,
     to_yaml,
 )
+from cmrl_jax.flags import Parser, names, parse, shown, writable
 from cmrl_jax.goal_files import find_table
 from cmrl_jax.run_dir import config_stem, find_run, new_run, resumed_run
 from cmrl_jax.stop import StopSignal
-from cmrl_jax.validate import check_goal_set
 
-COMMANDS = ("train", "eval", "plot", "bench", "render", "goals")
-# Commands and options of the design whose code is not there yet: refused by name.
-NOT_BUILT = ("sweep", "finetune")
-EVAL_NOT_BUILT = {"z": ("prior", "shuffled", "other", "text"), "physics": ("metaworld",)}
-
-
-class _Parser(argparse.ArgumentParser):
-    """argparse with our two-line errors in place of its usage text."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(message, f"see: {self.prog} --help")
+COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "goals")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -59,16 +49,15 @@ def _dispatch(words: list[str]) -> int:
     command = "train"
     if words and not words[0].startswith("-"):
         command, *words = words
-    if command in NOT_BUILT:
-        cause = f"the command '{command}' is not built yet"
-        raise ConfigError(cause, f"commands: {', '.join(COMMANDS)}")
     if command not in COMMANDS:
         near = suggest(command, COMMANDS)
         cure = f"{near}commands: {', '.join(COMMANDS)}; train needs --config ml4.yaml"
         raise ConfigError(f"unknown command '{command}'", cure)
     run = {
         "train": _train,
-        "eval": _eval,
+        "eval": evaluate_flags.run_eval,
+        "sweep": evaluate_flags.run_sweep,
+        "finetune": _finetune,
         "plot": _plot,
         "bench": _bench,
         "render": _render,
@@ -77,20 +66,9 @@ def _dispatch(words: list[str]) -> int:
     return run[command](words)
 
 
-def _parse(parser: argparse.ArgumentParser, words: list[str]) -> argparse.Namespace:
-    """Parses all of `words`; the first that means nothing is an error with a suggestion."""
-    args, unknown = parser.parse_known_args(words)
-    if unknown:
-        word = unknown[0].partition("=")[0]
-        flags = [flag for flag in parser._option_string_actions if flag.startswith("--")]
-        cure = f"{suggest(word, flags)}see: {parser.prog} --help"
-        raise ConfigError(f"unknown argument '{word}'", cure)
-    return args
-
-
 def train_parser() -> argparse.ArgumentParser:
     """Flags of `train`: one for each leaf of the config schema, with its text and default."""
-    parser = _Parser(
+    parser = Parser(
         prog="python train.py",
         usage="python train.py --config X.yaml [--section.key VALUE ...] [--run DIR] [--resume]",
         description="Meta-trains on the tasks of a YAML config, in one process, on any device.",
@@ -107,17 +85,11 @@ def train_parser() -> argparse.ArgumentParser:
         section = name.rpartition(".")[0]
         if section not in groups:
             groups[section] = parser.add_argument_group(section)
-        text = f"{f.metadata['doc']} [{_shown(default)}]".replace("%", "%%")
+        text = f"{f.metadata['doc']} [{shown(default)}]".replace("%", "%%")
         groups[section].add_argument(
             f"--{name}", metavar=_metavar(default, f, name), default=argparse.SUPPRESS, help=text
         )
     return parser
-
-
-def _shown(default: Any) -> str:
-    if isinstance(default, tuple):
-        return ",".join(str(item) for item in default)
-    return str(default).lower() if isinstance(default, bool) else str(default)
 
 
 def _metavar(default: Any, f: Any, name: str) -> str:
@@ -133,7 +105,7 @@ def _metavar(default: Any, f: Any, name: str) -> str:
 
 
 def _train(words: list[str]) -> int:
-    args = vars(_parse(train_parser(), words))
+    args = vars(parse(train_parser(), words))
     name, run, resume = args.pop("config"), args.pop("run"), args.pop("resume")
     if name is None and run is not None and resume:
         name = str(find_run(run) / "config.yaml")
@@ -167,95 +139,9 @@ def _check_extras(config: Config) -> None:
         raise ConfigError(cause, "pip install 'cmrl-jax[viz]', or set log.tensorboard: false")
 
 
-def _counts(text: str) -> tuple[int, ...]:
-    counts = tuple(int(item) for item in text.split(","))
-    if min(counts) < 0:
-        raise ValueError(text)
-    return counts
-
-
-def _natural(text: str) -> int:
-    number = int(text)
-    if number < 0:
-        raise ValueError(text)
-    return number
-
-
-_counts.__name__, _natural.__name__ = "list of counts", "whole number"  # argparse names them
-
-
-def eval_parser() -> argparse.ArgumentParser:
-    """Flags of `eval`."""
-    parser = _Parser(
-        prog="python train.py eval",
-        description="Evaluates a policy checkpoint: k adaptation episodes, then the one counted.",
-        allow_abbrev=False,
-    )
-    add = parser.add_argument
-    add("--run", metavar="DIR", type=Path, required=True, help="run directory")
-    add("--k", type=_counts, metavar="0,1,2", help="adaptation episodes [eval.final_k of the run]")
-    add("--goals", type=_natural, default=50, metavar="N", help="goals a task, 1 to 50 [50]")
-    add("--goal-set", default="heldout", metavar="SET", help="train, heldout or fresh:<seed>")
-    add("--seed", type=_natural, default=0, metavar="S", help="seed of the evaluation's draws [0]")
-    add("--horizon", type=_natural, metavar="H", help="control steps an episode [env.horizon]")
-    add("--checkpoint", type=_natural, metavar="N", help="iteration of the checkpoint [the last]")
-    add(
-        "--physics",
-        metavar="P",
-        choices=("mjx", "native", *EVAL_NOT_BUILT["physics"]),
-        help="mjx, native; metaworld is not built yet [env.physics of the run]",
-    )
-    add(
-        "--z",
-        default="posterior",
-        metavar="Z",
-        choices=("posterior", *EVAL_NOT_BUILT["z"]),
-        help="posterior; prior, shuffled, other and text are not built yet [posterior]",
-    )
-    add("--text", metavar="SENTENCE", help="a goal in your own words (not built yet)")
-    add("--json", type=Path, metavar="F", help="write the figures to this file")
-    return parser
-
-
-def _eval(words: list[str]) -> int:
-    args = _parse(eval_parser(), words)
-    for name, options in EVAL_NOT_BUILT.items():
-        if getattr(args, name) in options:
-            cause = f"--{name} {getattr(args, name)} is not built yet"
-            raise ConfigError(cause, f"leave --{name} out")
-    if args.text is not None:
-        raise ConfigError("--text is not built yet", "leave --text out")
-    check_goal_set(args.goal_set, "--goal-set")
-    if not 1 <= args.goals <= 50:
-        raise ConfigError(f"--goals is {args.goals}", "give 1 to 50: a goal set has 50 a task")
-    if args.horizon == 0:
-        raise ConfigError("--horizon is 0", "give at least one control step")
-    run = find_run(args.run)
-    config = resolve(*read_yaml(run / "config.yaml"))
-    k = args.k if args.k is not None else config.eval.final_k
-    if config.model.conditioning != "z" and any(k):
-        cause = f"--k {_shown(k)} with model.conditioning {config.model.conditioning}"
-        raise ConfigError(cause, "give --k 0: only a latent z can adapt")
-    _writable(args.json)
-
-    from cmrl_jax import evaluate_cli
-
-    return evaluate_cli.evaluate_run(
-        run=run,
-        k=k,
-        goals=args.goals,
-        goal_set=args.goal_set,
-        seed=args.seed,
-        horizon=args.horizon,
-        physics=args.physics,
-        checkpoint=args.checkpoint,
-        json_path=args.json,
-    )
-
-
 def plot_parser() -> argparse.ArgumentParser:
     """Flags of `plot`."""
-    parser = _Parser(
+    parser = Parser(
         prog="python train.py plot",
         description="Draws success, returns and adaptation of runs; seeds of one run as a band.",
         allow_abbrev=False,
@@ -273,7 +159,7 @@ def plot_parser() -> argparse.ArgumentParser:
 
 
 def _plot(words: list[str]) -> int:
-    args = _parse(plot_parser(), words)
+    args = parse(plot_parser(), words)
 
     from cmrl_jax import plots
 
@@ -284,12 +170,14 @@ def _plot(words: list[str]) -> int:
 
 def bench_parser() -> argparse.ArgumentParser:
     """Flags of `bench`."""
-    parser = _Parser(
+    parser = Parser(
         prog="python train.py bench",
         description="Measures physics, learner, start-up and memory on this machine.",
         allow_abbrev=False,
     )
-    parser.add_argument("--rows", default="", metavar="A,B", help="only rows of these kinds")
+    parser.add_argument(
+        "--rows", type=names, default=(), metavar="A,B", help="only rows of these kinds"
+    )
     parser.add_argument(
         "--json", type=Path, default=Path("bench.json"), metavar="F", help="[bench.json]"
     )
@@ -297,20 +185,19 @@ def bench_parser() -> argparse.ArgumentParser:
 
 
 def _bench(words: list[str]) -> int:
-    args = _parse(bench_parser(), words)
-    _writable(args.json)
+    args = parse(bench_parser(), words)
+    writable(args.json)
 
     from cmrl_jax import bench
 
-    rows = tuple(row.strip() for row in args.rows.split(",") if row.strip())
-    return bench.main(json_path=args.json, rows=rows)
+    return bench.main(json_path=args.json, rows=args.rows)
 
 
 def _render(words: list[str]) -> int:
-    parser = _Parser(
+    parser = Parser(
         prog="python train.py render", description=render_flags.DESCRIPTION, allow_abbrev=False
     )
-    options = render_flags.options_of(_parse(render_flags.add_flags(parser), words))
+    options = render_flags.options_of(parse(render_flags.add_flags(parser), words))
 
     from envs.render import choose_gl
 
@@ -326,23 +213,22 @@ def _render(words: list[str]) -> int:
 def _goals(words: list[str]) -> int:
     from cmrl_jax import goals_cli
 
-    parser = _Parser(
+    parser = Parser(
         prog="python train.py goals", description=goals_cli.DESCRIPTION, allow_abbrev=False
     )
     goals_cli.add_flags(parser)
-    return goals_cli.run(_parse(parser, words))
+    return goals_cli.run(parse(parser, words))
 
 
-def _writable(path: Path | None) -> None:
-    """Fails now rather than after an hour of figures."""
-    if path is None:
-        return
-    try:
-        existed = path.exists()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("a", encoding="utf-8").close()
-        if not existed:
-            path.unlink()
-    except OSError as error:
-        cause = f"cannot write {path}: {error.strerror}"
-        raise ConfigError(cause, "give --json a file you may write to") from error
+def _finetune(words: list[str]) -> int:
+    parser = Parser(
+        prog="python train.py finetune", description=finetune_flags.DESCRIPTION, allow_abbrev=False
+    )
+    args = parse(finetune_flags.add_flags(parser), words)
+    options, run = finetune_flags.options_of(args), find_run(args.run)
+    finetune_flags.check_run(resolve(*read_yaml(run / "config.yaml")), options)
+    writable(args.json)
+
+    from cmrl_jax import finetune_cli
+
+    return finetune_cli.finetune_run(run, options, args.json, args.figure)

@@ -6,124 +6,69 @@ prior without a goal factor), deterministically apart from that draw. So the sco
 of episode k, and one run of max(k) + 1 episodes gives the whole curve (oyster evaluates the same
 way: katerakelly/oyster: rlkit/core/rl_algorithm.py).
 
-Lanes are task x goal, in batches of a fixed number of lanes, so that every evaluation of a process
-runs one compiled program.
+Lanes are task x goal x draw of each policy, in batches of a fixed number of lanes, so that every
+evaluation of a process runs one compiled program, controls included.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from cmrl_jax.config import Config
-from cmrl_jax.context import Belief, init_belief
+from cmrl_jax.context import init_belief
+from cmrl_jax.controls import donors
+from cmrl_jax.episode import Episode, Lanes, PolicyParams, ZSource, make_episode
 from cmrl_jax.learner import Learner
-from cmrl_jax.rollout import rollout
 from envs.sawyer import Ml4Env
-from envs.tasks import task_id
+from envs.tasks import TASKS, task_id
+
+GOAL_IDS = 1000  # more than the goals of any set
 
 
-class PolicyParams(NamedTuple):
-    """What acting needs: the policy checkpoint's arrays."""
+@dataclass(frozen=True)
+class Trial:
+    """What policies are scored on.
 
-    actor_params: Any
-    encoder_params: Any  # None without a latent
-    obs_stats: Any
-
-
-class Episode(NamedTuple):
-    """Scores of one episode of every lane, each (lane,)."""
-
-    success_any: jax.Array  # at any step, Meta-World's rule
-    success_last: jax.Array
-    returns: jax.Array
-    first_success: jax.Array  # control step, the horizon where there is none
-    final_distance: jax.Array  # metres
-    faults: jax.Array  # times the lane's physics was put back
-
-
-EpisodeFn = Callable[..., tuple[Belief | None, Episode]]
-
-
-def make_episode(config: Config, env: Ml4Env, learner: Learner, horizon: int) -> EpisodeFn:
-    """Builds one evaluation episode of every lane, a jittable function.
-
-    Returns:
-        (params, belief, env_task (lane,), train_row (lane,), lane_id (lane,), placement (lane, 3),
-        goal (lane, G), key) -> belief with the episode added, Episode. `train_row` is the task's
-        row among the training tasks, used where the conditioning is a task id. A lane's z depends
-        on key and `lane_id`, not on its place in the batch.
+    Attributes:
+        tasks: task names.
+        placements: goals (task, goal, 3), fixture placements in metres.
+        texts: text vector that a lane is given (policy, task, goal, G).
+        first_goal: number of the first goal, by which its lanes' noise is named.
+        draws: z draws a goal.
+        z: one of `evaluate_flags.Z_SOURCES`.
+        deterministic: whether actions are the tanh of the mean.
     """
-    inference = learner.inference
-    chunk = config.collect.chunk if horizon % config.collect.chunk == 0 else 1
 
-    def episode(params, belief, env_task, train_row, lane_id, placement, goal, key):
-        lanes = env_task.shape[0]
-        k_z, k_act = jax.random.split(key)
-        ones = jnp.ones((lanes,))
-        if inference is None:
-            zc = learner.task_conditioning(train_row)
-        else:
-            posterior = inference.posterior_of_belief(params.encoder_params, belief, goal, ones)
-            lane_key = jax.vmap(lambda lane: jax.random.fold_in(k_z, lane))(lane_id)
-            zc = jax.vmap(inference.sample_z)(lane_key, posterior)
+    tasks: tuple[str, ...]
+    placements: np.ndarray
+    texts: np.ndarray
+    first_goal: int = 0
+    draws: int = 1
+    z: str = "posterior"
+    deterministic: bool = True
 
-        def run_chunk(carry, key):
-            state, belief = carry
-            state, transitions, stats = rollout(
-                env,
-                learner,
-                (params.actor_params, params.obs_stats),
-                state,
-                zc,
-                key,
-                chunk,
-                horizon,
-                deterministic=True,
-            )
-            if inference is not None:
-                by_lane = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)
-                by_lane = replace(
-                    by_lane,
-                    obs=learner.normalize_obs(params.obs_stats, by_lane.obs),
-                    next_obs=learner.normalize_obs(params.obs_stats, by_lane.next_obs),
-                )
-                mask = jnp.ones((lanes, chunk))
-                belief = inference.update_belief(
-                    params.encoder_params, belief, by_lane, mask, goal, ones
-                )
-            return (state, belief), (transitions.reward, stats.success, stats.distance)
-
-        state = jax.vmap(env.reset_to)(env_task, placement)
-        keys = jax.random.split(k_act, horizon // chunk)
-        (state, belief), scores = jax.lax.scan(run_chunk, (state, belief), keys)
-        reward, success, distance = (x.reshape(horizon, lanes) for x in scores)
-        succeeded = jnp.any(success, 0)
-        return belief, Episode(
-            success_any=succeeded,
-            success_last=success[-1],
-            returns=jnp.sum(reward, 0),
-            first_success=jnp.where(succeeded, jnp.argmax(success, 0), horizon),
-            final_distance=distance[-1],
-            faults=state.faults,
+    def of_goal(self, goal: int) -> Trial:
+        """One goal of every task, with the noise that it has among the others."""
+        return replace(
+            self,
+            placements=self.placements[:, goal : goal + 1],
+            texts=self.texts[:, :, goal : goal + 1],
+            first_goal=self.first_goal + goal,
         )
-
-    return episode
 
 
 class Evaluator:
-    """Runs evaluations with one compiled episode of a fixed number of lanes.
+    """Runs evaluations with one compiled episode of a fixed number of policies and lanes.
 
     Args:
-        tasks: names of the tasks to evaluate.
-        goal_vectors: text vector of each of those tasks, the fixed paraphrase, (task, G).
-        lanes: lanes of a batch; the last batch of an evaluation is padded.
+        lanes: lanes of each policy in a batch; the last batch of an evaluation is padded.
         horizon: control steps an episode; the run's own by default.
+        policies: policies of one configuration that are scored side by side.
     """
 
     def __init__(
@@ -131,102 +76,114 @@ class Evaluator:
         config: Config,
         env: Ml4Env,
         learner: Learner,
-        tasks: Sequence[str],
-        goal_vectors: np.ndarray,
         lanes: int,
         horizon: int | None = None,
+        policies: int = 1,
     ):
-        self.tasks = tuple(tasks)
-        self.lanes = lanes
+        self.lanes, self.policies = lanes, policies
         self.horizon = horizon or config.env.horizon
-        self._goal_vectors = np.asarray(goal_vectors, np.float32)
-        train = config.tasks.train
-        self._train_row = np.array([train.index(t) if t in train else 0 for t in tasks], np.int32)
-        self._env_task = np.array([task_id(name) for name in tasks], np.int32)
-        self._learner = learner
+        self._train_tasks = config.tasks.train
+        self._inference = learner.inference
         self._episode = jax.jit(make_episode(config, env, learner, self.horizon))
-        self._compiled: Callable[..., Any] | None = None
-
-    def _empty_belief(self) -> Belief | None:
-        inference = self._learner.inference
-        return init_belief((self.lanes,), inference.latent_dim) if inference else None
+        self._compiled: Any = None
 
     @property
     def is_compiled(self) -> bool:
         return self._compiled is not None
 
-    def compile(self, params: PolicyParams) -> None:
-        """Compiles the episode for these parameter shapes; later calls do not compile."""
+    def compile(self, params: PolicyParams, text_width: int) -> None:
+        """Compiles the episode for one policy's parameter shapes; later calls do not compile."""
         if self._compiled is None:
-            task, goal = np.zeros(self.lanes, np.int32), np.zeros((self.lanes, 3), np.float32)
-            text = np.zeros((self.lanes, self._goal_vectors.shape[-1]), np.float32)
-            args = (params, self._empty_belief(), task, task, task, goal, text, jax.random.key(0))
+            shape = (self.policies, self.lanes)
+            text, zero = np.zeros((*shape, text_width), np.float32), np.zeros(self.lanes, np.int32)
+            lanes = Lanes(zero, zero, zero, np.zeros((self.lanes, 3), np.float32))
+            source = ZSource(self._empty(self.lanes), text, np.zeros(shape, np.float32))
+            stacked = _stack([params] * self.policies)
+            args = (stacked, source.belief, text, source, lanes, np.bool_(True), jax.random.key(0))
             self._compiled = self._episode.lower(*args).compile()
 
+    def memory_bytes(self) -> int:
+        """Memory that the compiled episode needs beside its arguments, in bytes; 0: unknown."""
+        stats = self._compiled.memory_analysis() if self._compiled else None
+        return 0 if stats is None else stats.temp_size_in_bytes + stats.output_size_in_bytes
+
     def run(
-        self, params: PolicyParams, placements: np.ndarray, k: Sequence[int], seed: int
+        self, policies: Sequence[PolicyParams], trial: Trial, k: Sequence[int], seed: int
     ) -> dict[int, Episode]:
         """Scores at every k of `k`.
 
         Args:
-            placements: goals, (task, goal, 3) fixture placements in metres.
-            seed: seed of the z draws; a draw depends on it, task, goal and episode alone.
+            policies: at most as many as the evaluator has place for.
+            seed: seed of the draws; a draw depends on it, task, goal, draw and episode alone.
 
         Returns:
-            k -> Episode of numpy arrays (task, goal).
+            k -> Episode of numpy arrays (policy, task, goal, draw).
         """
-        self.compile(params)
-        assert self._compiled is not None
-        tasks, goals = placements.shape[:2]
-        task = np.repeat(np.arange(tasks), goals)
-        placement = np.asarray(placements, np.float32).reshape(-1, 3)
-        lane_id = self._env_task[task] * np.int32(1000) + np.tile(
-            np.arange(goals, dtype=np.int32), tasks
-        )
-        key = jax.random.key(seed)
-        parts: dict[int, list[Episode]] = {n: [] for n in k}
-        for start in range(0, len(task), self.lanes):
-            index = np.minimum(np.arange(start, start + self.lanes), len(task) - 1)
-            belief, row = self._empty_belief(), task[index]
-            for episode in range(max(k) + 1):
-                belief, scores = self._compiled(
+        self.compile(policies[0], trial.texts.shape[-1])
+        params = _stack([*policies, *[policies[-1]] * (self.policies - len(policies))])
+        tasks, goals = trial.placements.shape[:2]
+        lanes, texts = self._lanes(trial), self._texts(trial)
+        count = len(lanes.lane_id)
+        donor = donors(trial.z, lanes.lane_id, lanes.env_task)
+        uses_belief = trial.z not in ("prior", "text")
+        text_mask = np.full((self.policies, self.lanes), trial.z != "prior", np.float32)
+        key, beliefs = jax.random.key(seed), self._empty(count)
+        scores: dict[int, Episode] = {}
+        for episode in range(max(k) + 1):
+            # Every batch draws from what was known before the episode, its donors' lanes too.
+            before = jax.tree.map(np.copy, beliefs)
+            parts = []
+            for start in range(0, count, self.lanes):
+                index = np.minimum(np.arange(start, start + self.lanes), count - 1)
+                giver = donor[index]
+                belief = jax.tree.map(lambda x: x[:, giver], before) if uses_belief else None
+                belief, part = self._compiled(
                     params,
-                    belief,
-                    self._env_task[row],
-                    self._train_row[row],
-                    lane_id[index],
-                    placement[index],
-                    self._goal_vectors[row],
+                    jax.tree.map(lambda x: x[:, index], before),
+                    texts[:, index],
+                    ZSource(belief or self._empty(self.lanes), texts[:, giver], text_mask),
+                    Lanes(*(x[index] for x in lanes)),
+                    np.bool_(trial.deterministic),
                     jax.random.fold_in(key, episode),
                 )
-                if episode in parts:
-                    parts[episode].append(jax.tree.map(np.asarray, scores))
-        join = lambda *x: np.concatenate(x)[: len(task)].reshape(tasks, goals)
-        return {n: jax.tree.map(join, *episodes) for n, episodes in parts.items()}
+                valid = min(self.lanes, count - start)
+                for all_lanes, new in zip(*map(jax.tree.leaves, (beliefs, belief)), strict=True):
+                    all_lanes[:, start : start + valid] = np.asarray(new)[:, :valid]
+                parts.append(jax.tree.map(np.asarray, part))
+            if episode in k:
+                joined = jax.tree.map(lambda *x: np.concatenate(x, 1)[:, :count], *parts)
+                shape = (len(policies), tasks, goals, trial.draws)
+                scores[episode] = jax.tree.map(lambda x: x[: shape[0]].reshape(shape), joined)
+        return {n: scores[n] for n in k}
+
+    def _empty(self, lanes: int) -> Any:
+        """Empty beliefs of all policies, numpy (policy, lane, ...); None without a latent."""
+        if self._inference is None:
+            return None
+        belief = init_belief((self.policies, lanes), self._inference.latent_dim)
+        return jax.tree.map(np.array, belief)
+
+    def _lanes(self, trial: Trial) -> Lanes:
+        goals, train = trial.placements.shape[1], self._train_tasks
+        shape = (len(trial.tasks), goals, trial.draws)
+        task, goal, draw = (x.ravel() for x in np.indices(shape, np.int32))
+        env_task = np.array([task_id(name) for name in trial.tasks], np.int32)[task]
+        rows = [train.index(name) if name in train else 0 for name in trial.tasks]
+        return Lanes(
+            env_task=env_task,
+            train_row=np.array(rows, np.int32)[task],
+            lane_id=(draw * np.int32(len(TASKS)) + env_task) * np.int32(GOAL_IDS)
+            + (goal + np.int32(trial.first_goal)),
+            placement=np.asarray(trial.placements, np.float32)[task, goal],
+        )
+
+    def _texts(self, trial: Trial) -> np.ndarray:
+        """The text of every lane (policy, lane, G), for all places of the evaluator."""
+        texts = np.repeat(np.asarray(trial.texts, np.float32), trial.draws, axis=2)
+        texts = texts.reshape(len(texts), -1, texts.shape[-1])
+        return texts[np.minimum(np.arange(self.policies), len(texts) - 1)]
 
 
-def summarise(scores: dict[int, Episode], tasks: Sequence[str]) -> dict[str, Any]:
-    """Means over goals: {task: {k: {"success_any": .., "success_last": .., "return": .., ...}}}."""
-    return {
-        task: {
-            str(k): {
-                "success_any": float(episode.success_any[row].mean()),
-                "success_last": float(episode.success_last[row].mean()),
-                "return": float(episode.returns[row].mean()),
-                "first_success_step": float(episode.first_success[row].mean()),
-                "final_distance": float(episode.final_distance[row].mean()),
-            }
-            for k, episode in scores.items()
-        }
-        for row, task in enumerate(tasks)
-    }
-
-
-def format_scores(summary: dict[str, Any]) -> str:
-    """A table of an evaluation: success at any and last step and return, per task and k."""
-    lines = [f"{'task':<14} {'k':>3} {'any step':>9} {'last step':>9} {'return':>8}"]
-    for task, by_k in summary.items():
-        for k, f in by_k.items():
-            figures = f"{f['success_any']:>9.2f} {f['success_last']:>9.2f} {f['return']:>8.0f}"
-            lines.append(f"{task:<14} {k:>3} {figures}")
-    return "\n".join(lines)
+def _stack(policies: Sequence[PolicyParams]) -> PolicyParams:
+    """Policies with a leading policy axis, on the host: nothing to compile."""
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *policies)

@@ -8,20 +8,17 @@ host every state it passes through.
 from __future__ import annotations
 
 import collections
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from cmrl_jax.checkpoint import policy_store
-from cmrl_jax.config import Config
-from cmrl_jax.config_io import read_yaml, resolve
 from cmrl_jax.evaluate import Evaluator
+from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.film import Camera, Episode, Film, write_sheet, write_video
-from cmrl_jax.metrics import package_versions
-from cmrl_jax.session import Session, policy_params, prepare_jax
+from cmrl_jax.session import Policy, Session, load_policy, prepare_jax
+from cmrl_jax.trials import evaluation_config, trial_of
 from envs.native import unpack
 from envs.physics import settled_starts
 from envs.sawyer import Ml4Env, State
@@ -34,8 +31,8 @@ class FilmedEnv(Ml4Env):
     A lane is known by its task and placement, so no two lanes of an evaluation may share both.
     """
 
-    def __init__(self, goal_observable: bool = False):
-        super().__init__(goal_observable, physics="native")
+    def __init__(self, goal_observable: bool = False, obs_mode: str = "metaworld"):
+        super().__init__(goal_observable, "native", obs_mode)
         # (task, placement) -> step -> its qpos and success in every episode so far.
         self._seen: dict[Any, dict[int, list[tuple[np.ndarray, bool]]]] = collections.defaultdict(
             lambda: collections.defaultdict(list)
@@ -73,8 +70,7 @@ def _lane(task: int, placement: Any) -> tuple[int, bytes]:
 
 def film_run(
     session: Session,
-    params: Any,
-    goal_vectors: np.ndarray,
+    policy: Policy,
     k: int,
     goal: int,
     goal_set: str,
@@ -85,25 +81,21 @@ def film_run(
     """Runs k exploration episodes and the reported one of every evaluated task.
 
     Args:
-        params: `PolicyParams` of the session's policy.
-        goal_vectors: (task, G), the run's own.
         goal: index into the goal set.
         caption: where the policy comes from.
     """
-    env = FilmedEnv(session.config.env.goal_observable)
+    env = FilmedEnv(session.config.env.goal_observable, session.config.env.obs_mode)
     tasks = session.eval_tasks
-    evaluator = Evaluator(
-        session.config, env, session.learner, tasks, goal_vectors, len(tasks), horizon
-    )
-    # A z draw depends on the goal's place in the set, so those before it run along.
-    placements = session.placements(goal_set, goal + 1)
-    scores = evaluator.run(params, placements, range(k + 1), seed)
+    evaluator = Evaluator(session.config, env, session.learner, len(tasks), horizon)
+    options = EvalOptions(goals=goal + 1, goal_set=goal_set)
+    trial = trial_of([policy], session, options, tasks).of_goal(goal)
+    scores = evaluator.run([policy.params], trial, range(k + 1), seed)
     names = [f"exploration {i + 1} of {k}" for i in range(k)] + [f"reported, k = {k}"]
     films = []
     for row, task in enumerate(tasks):
-        place = placements[row, goal]
+        place = trial.placements[row, 0]
         episodes = tuple(
-            Episode(name, qpos, success, float(scores[i].returns[row, goal]))
+            Episode(name, qpos, success, float(scores[i].returns[0, row, 0, 0]))
             for i, (name, (qpos, success)) in enumerate(
                 zip(names, env.episodes(task, place), strict=True)
             )
@@ -112,11 +104,6 @@ def film_run(
         where = f"{held_out}goal {goal} of '{goal_set}'; {caption}"
         films.append(Film(task, where, place, episodes))
     return films
-
-
-def on_native(config: Config) -> Config:
-    """The configuration with MuJoCo C as its physics: a policy does not know its simulator."""
-    return replace(config, env=replace(config.env, physics="native", impl="jax"))
 
 
 def render_run(
@@ -142,22 +129,13 @@ def render_run(
     Raises:
         ConfigError: no such checkpoint, or it does not fit this program.
     """
-    config = on_native(resolve(*read_yaml(run / "config.yaml")))
+    config = evaluation_config(run, "native")
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
-    state = jax.eval_shape(session.learner.init, jax.random.key(0))
-    vectors = jax.ShapeDtypeStruct(session.goals.vectors[:, 0].shape, np.float32)
-    abstract = {"params": policy_params(state), "goal_vectors": vectors}
-    with policy_store(run, read_only=True) as store:
-        trees, meta = store.restore(
-            {"policy": abstract}, step=checkpoint, versions=package_versions()
-        )
-    policy = trees["policy"]
-    caption = f"{config.name}, iteration {meta['iteration']}, {meta['env_steps']:,} env steps"
-    goal_vectors = np.asarray(policy["goal_vectors"])
-    films = film_run(
-        session, policy["params"], goal_vectors, k, goal, goal_set, seed, horizon, caption
-    )
+    policy = load_policy(run, session, checkpoint)
+    steps = f"iteration {policy.meta['iteration']}, {policy.meta['env_steps']:,} env steps"
+    caption = f"{config.name}, {steps}"
+    films = film_run(session, policy, k, goal, goal_set, seed, horizon, caption)
     for film in films:
         video, sheet = out / f"{film.task}.mp4", out / f"{film.task}.png"
         with Camera(film) as camera:

@@ -6,16 +6,23 @@ Shared by training, evaluation and benchmarks.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmrl_jax.checkpoint import policy_store
 from cmrl_jax.config import Config, ConfigError
-from cmrl_jax.evaluate import Evaluator, PolicyParams
+from cmrl_jax.controls import text_per_goal
+from cmrl_jax.episode import PolicyParams
+from cmrl_jax.evaluate import Evaluator, Trial
 from cmrl_jax.goals import GoalTable, load_goals
 from cmrl_jax.learner import Learner, TrainState, make_learner
+from cmrl_jax.metrics import package_versions
 from envs.goal_sets import load_goal_set
 from envs.sawyer import Ml4Env
 
@@ -51,9 +58,11 @@ class Session:
         self.train_goals = jnp.asarray(self.goals.select(config.tasks.train).vectors)
         self.learner: Learner = make_learner(config, self.train_goals)
 
-    def placements(self, goal_set: str, goals: int) -> np.ndarray:
-        """The first `goals` placements of a named set for the evaluated tasks (task, goal, 3)."""
-        return call_envs(lambda: load_goal_set(goal_set, self.eval_tasks))[:, :goals]
+    def placements(
+        self, goal_set: str, goals: int, tasks: Sequence[str] | None = None
+    ) -> np.ndarray:
+        """The first `goals` placements of a named set (task, goal, 3), by default for all tasks."""
+        return call_envs(lambda: load_goal_set(goal_set, tasks or self.eval_tasks))[:, :goals]
 
     def train_placements(self) -> jax.Array | None:
         """Placements that training draws from; None where it draws from the reset box."""
@@ -62,24 +71,60 @@ class Session:
         train = call_envs(lambda: load_goal_set("train", self.config.tasks.train))
         return jnp.asarray(train, jnp.float32)
 
-    def evaluator(
-        self, horizon: int | None = None, goal_vectors: np.ndarray | None = None
-    ) -> Evaluator:
-        """The evaluator of the run; a batch of it is one periodic evaluation.
+    def trial(self, goal_set: str, goals: int) -> Trial:
+        """The protocol's own trial: every evaluated task, its first sentence, one draw a goal."""
+        texts = text_per_goal(list(self.goals.vectors[:, :1]), goals)
+        return Trial(self.eval_tasks, self.placements(goal_set, goals), texts[None])
 
-        Args:
-            horizon: control steps an episode; None for the run's own.
-            goal_vectors: (task, G); None for the first paraphrase of the table.
-        """
+    def evaluator(self) -> Evaluator:
+        """The evaluator of a training run; a batch of it is one periodic evaluation."""
         return Evaluator(
             self.config,
             self.env,
             self.learner,
-            self.eval_tasks,
-            self.goals.vectors[:, 0] if goal_vectors is None else goal_vectors,
             lanes=self.config.eval.goals * len(self.eval_tasks),
-            horizon=horizon,
         )
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy checkpoint.
+
+    Attributes:
+        params: what acts.
+        goal_vectors: the text vectors that the run evaluates with, {task: (G,)}.
+        meta: the checkpoint's record (`checkpoint.META_FIELDS`).
+    """
+
+    params: PolicyParams
+    goal_vectors: dict[str, np.ndarray]
+    meta: dict[str, Any]
+
+
+def load_policy(
+    run: Path, session: Session, checkpoint: int | None = None, tasks: Sequence[str] | None = None
+) -> Policy:
+    """Reads a policy checkpoint of a run.
+
+    Args:
+        session: of the run's configuration, or of one with the same policy.
+        checkpoint: iteration; None for the newest.
+        tasks: the run's training, then test tasks, where the session's are others.
+
+    Raises:
+        ConfigError: no such checkpoint, or it does not fit the session.
+    """
+    tasks = tuple(tasks or session.eval_tasks)
+    state = jax.eval_shape(session.learner.init, jax.random.key(0))
+    shape = (len(tasks), session.goals.vectors.shape[-1])
+    vectors = jax.ShapeDtypeStruct(shape, np.float32)
+    abstract = {"params": policy_params(state), "goal_vectors": vectors}
+    with policy_store(run, read_only=True) as store:
+        trees, meta = store.restore(
+            {"policy": abstract}, step=checkpoint, versions=package_versions()
+        )
+    found = np.asarray(trees["policy"]["goal_vectors"])
+    return Policy(trees["policy"]["params"], dict(zip(tasks, found, strict=True)), meta)
 
 
 def policy_params(state: TrainState) -> PolicyParams:

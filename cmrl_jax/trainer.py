@@ -27,7 +27,6 @@ from cmrl_jax.collect import (
 )
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import to_yaml
-from cmrl_jax.evaluate import format_scores, summarise
 from cmrl_jax.goals import check_same_table
 from cmrl_jax.metrics import (
     LEADING_COLUMNS,
@@ -40,6 +39,7 @@ from cmrl_jax.metrics import (
     package_versions,
     write_versions,
 )
+from cmrl_jax.scores import format_scores, of_policy, summarise
 from cmrl_jax.session import Session, policy_params, prepare_jax
 from cmrl_jax.stop import StopSignal
 
@@ -245,11 +245,12 @@ class _Run:
 
     def scores(self, goals: int, k: tuple[int, ...]) -> dict[str, Any]:
         params = policy_params(self.state.learner)
+        trial = self.session.trial(self.config.eval.goal_set, goals)
         if not self.evaluator.is_compiled:
-            self.timed("the evaluation episode", lambda: self.evaluator.compile(params))
-        placements = self.session.placements(self.config.eval.goal_set, goals)
-        scores = self.evaluator.run(params, placements, k, self.config.eval.seed)
-        return summarise(scores, self.session.eval_tasks)
+            width = trial.texts.shape[-1]
+            self.timed("the evaluation episode", lambda: self.evaluator.compile(params, width))
+        scores = self.evaluator.run([params], trial, k, self.config.eval.seed)
+        return summarise(of_policy(scores, 0), trial.tasks)
 
     def share_done(self) -> float:
         total, minutes = self.schedule.iterations, self.config.train.minutes

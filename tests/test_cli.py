@@ -36,7 +36,6 @@ def calls(here, monkeypatch):
 
     for module, function in (
         ("trainer", "train"),
-        ("evaluate_cli", "evaluate_run"),
         ("bench", "main"),
     ):
         fake = SimpleNamespace(**{function: recorder(module)})
@@ -141,11 +140,6 @@ def test_missing_extra(refused, monkeypatch):
         (["--resume"], "no --config given", "ml4.yaml"),
         (["trian"], "unknown command 'trian'", "did you mean 'train'?"),
         (["configs/ml4.yaml"], "unknown command 'configs/ml4.yaml'", "--config ml4.yaml"),
-        (
-            ["sweep", "--runs", "x"],
-            "the command 'sweep' is not built yet",
-            "train, eval, plot, bench",
-        ),
         (["goals", "--shwo"], "unknown argument '--shwo'", "'--show'?"),
         (["goals", "--encoder", "clip"], "unknown encoder 'clip'", "clip-vit-b-32"),
         (["goals", "--show", "--encoder", "zeor"], "'zeor' (goals.table)", "did you mean 'zero'?"),
@@ -159,17 +153,6 @@ def test_missing_extra(refused, monkeypatch):
         (["--config", "ml4.yaml", "--seed", "1e3"], "the text '1e3' (--seed)", "write 1000"),
         (["--config", "ml4.yaml", "--log.progress", "maybe"], "true or false", "true or false"),
         (["--config", "ml4.yaml", "--model.net", "sotf"], "(--model.net)", "did you mean 'soft'?"),
-        (["eval"], "required: --run", "--help"),
-        (["eval", "--run", "nope"], "run directory nope does not exist", "train"),
-        (["eval", "--run", "x", "--k", "0,a"], "--k: invalid", "--help"),
-        (["eval", "--run", "x", "--k", "0,-1"], "--k: invalid", "--help"),
-        (["eval", "--run", "x", "--goals", "51"], "--goals is 51", "1 to 50"),
-        (["eval", "--run", "x", "--horizon", "0"], "--horizon is 0", "at least one"),
-        (["eval", "--run", "x", "--goal-set", "hldout"], "'hldout'", "did you mean 'heldout'?"),
-        (["eval", "--run", "x", "--z", "shuffled"], "--z shuffled is not built yet", "--z"),
-        (["eval", "--run", "x", "--z", "no"], "--z: invalid choice", "--help"),
-        (["eval", "--run", "x", "--physics", "metaworld"], "--physics metaworld is not", "leave"),
-        (["eval", "--run", "x", "--text", "shut it"], "--text is not built yet", "leave"),
         (["render", "--run", "nope"], "run directory nope does not exist", "train"),
         (["render", "--run", "x", "--k", "-1"], "--k is -1", "0 or more"),
         (["render", "--run", "x", "--every", "0"], "--every is 0", "1 or more"),
@@ -195,32 +178,7 @@ def test_other_exceptions_keep_their_traceback(calls, monkeypatch):
         main(["--config", "ml4.yaml"])
 
 
-# Evaluation and benchmark -----------------------------------------------------------------------
-
-
-def test_eval_hands_over_its_flags(calls, here):
-    make_run(here / "r")
-    words = ["--k", "0,1,5", "--goals", "4", "--goal-set", "fresh:7", "--seed", "3"]
-    words += ["--horizon", "500", "--checkpoint", "12", "--physics", "native"]
-    words += ["--json", "out/f.json"]
-    assert main(["eval", "--run", "r", *words]) == 0
-    assert main(["eval", "--run", "r"]) == 0
-    assert calls[0][2] == {
-        "run": Path("r"), "k": (0, 1, 5), "goals": 4, "goal_set": "fresh:7", "seed": 3,
-        "horizon": 500, "physics": "native", "checkpoint": 12, "json_path": Path("out/f.json"),
-    }  # fmt: skip
-    assert calls[1][2] == {
-        "run": Path("r"), "k": (0, 1, 2), "goals": 50, "goal_set": "heldout", "seed": 0,
-        "horizon": None, "physics": None, "checkpoint": None, "json_path": None,
-    }  # fmt: skip
-    assert list((here / "out").iterdir()) == []  # tried, and left to the command to write
-
-
-def test_eval_without_a_latent_does_not_adapt(calls, refused, here):
-    make_run(here / "r", "mtsac.yaml")
-    assert "--k 0,2" in refused("eval", "--run", "r", "--k", "0,2")[0]
-    assert main(["eval", "--run", "r"]) == 0
-    assert calls[0][2]["k"] == (0,)
+# Benchmark --------------------------------------------------------------------------------------
 
 
 def test_bench_hands_over_its_flags(calls):
@@ -236,7 +194,7 @@ def test_help_and_mistakes_import_neither_jax_nor_mujoco():
     script = """
 import sys
 from cmrl_jax.cli import main
-for command in ([], ["eval"], ["bench"], ["render"], ["goals"]):
+for command in ([], ["eval"], ["sweep"], ["finetune"], ["bench"], ["render"], ["goals"]):
     try:
         main([*command, "--help"])
     except SystemExit as stop:

@@ -14,10 +14,11 @@ from PIL import Image
 
 from cmrl_jax.checkpoint import policy_store
 from cmrl_jax.config_io import load_config, to_yaml
+from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.film import HEIGHT, STRIP, WIDTH, Episode
 from cmrl_jax.metrics import package_versions
-from cmrl_jax.render import FilmedEnv, film_run, on_native
-from cmrl_jax.session import Session, policy_params
+from cmrl_jax.render import FilmedEnv, film_run
+from cmrl_jax.session import Policy, Session, policy_params
 from envs.goal_sets import load_goal_set
 from envs.reference import record_rollout
 from envs.tasks import TASKS
@@ -28,7 +29,7 @@ STEPS = 100  # the scripted policies have succeeded by then
 
 @pytest.fixture(scope="module")
 def session():
-    return Session(on_native(load_config("smoke.yaml")))
+    return Session(load_config("smoke.yaml", {"env.physics": "native"}))
 
 
 @pytest.fixture(scope="module")
@@ -63,17 +64,17 @@ def test_filmed_states_are_metaworlds():
 
 def test_a_film_is_the_evaluation_itself(session, params):
     """The returns of the evaluator on an environment that keeps nothing."""
-    vectors = session.goals.vectors[:, 0]
-    films = film_run(session, params, vectors, 1, 1, "heldout", 5, 20, "a policy")
-    evaluator = session.evaluator(horizon=20)
-    scores = evaluator.run(params, session.placements("heldout", 2), (0, 1), seed=5)
+    vectors = dict(zip(session.eval_tasks, session.goals.vectors[:, 0], strict=True))
+    films = film_run(session, Policy(params, vectors, {}), 1, 1, "heldout", 5, 20, "a policy")
+    evaluator = Evaluator(session.config, session.env, session.learner, lanes=8, horizon=20)
+    scores = evaluator.run([params], session.trial("heldout", 2), (0, 1), seed=5)
     assert [film.task for film in films] == list(session.eval_tasks)
     for row, film in enumerate(films):
         assert [e.name for e in film.episodes] == ["exploration 1 of 1", "reported, k = 1"]
         assert ("held out" in film.caption) == (film.task in session.config.tasks.test)
         for k, episode in enumerate(film.episodes):
             # Another number of lanes: sums in another order.
-            np.testing.assert_allclose(episode.returns, scores[k].returns[row, 1], rtol=1e-4)
+            np.testing.assert_allclose(episode.returns, scores[k].returns[0, row, 1, 0], rtol=1e-4)
             assert episode.qpos.shape == (21, 10)
     first, second = films[0].episodes
     assert not np.array_equal(first.qpos, second.qpos)  # another z
@@ -117,6 +118,7 @@ def test_a_policy_without_latent_explores_nothing(tmp_path, refused):
 FILM = """
 import sys
 import numpy as np
+from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.film import Camera, Episode, Film, write_sheet, write_video
 from envs.goal_sets import load_goal_set
 from envs.reference import record_rollout

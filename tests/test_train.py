@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 
 from cmrl_jax import goal_files
-from cmrl_jax.checkpoint import full_store, policy_store
+from cmrl_jax.checkpoint import full_store
 from cmrl_jax.cli import main
 from cmrl_jax.collect import init_run, make_train_iteration
 from cmrl_jax.config import lane_groups
 from cmrl_jax.config_io import load_config
-from cmrl_jax.session import Session, policy_params
+from cmrl_jax.session import Session, load_policy
 
 ROOT = Path(__file__).resolve().parent.parent
 ITERATIONS = 3
@@ -219,27 +219,21 @@ def test_eval_restores_the_policy_in_another_process(finished, tmp_path):
     assert "window-close" in done.stdout and "any step" in done.stdout
 
 
-def test_evaluation_does_not_depend_on_the_order_of_tasks_or_on_what_was_evaluated_before(finished):
+def test_evaluation_does_not_depend_on_what_was_evaluated_before_or_beside(finished):
     """Trap 8: a belief that survived from one task to the next would change these figures."""
     config = load_config(str(finished[0] / "config.yaml"))
     session = Session(config)
-    state = jax.eval_shape(session.learner.init, jax.random.key(0))
-    abstract = {
-        "params": policy_params(state),
-        "goal_vectors": jax.eval_shape(lambda: session.goals.vectors[:, 0]),
-    }
-    with policy_store(finished[0], read_only=True) as store:
-        params = store.restore({"policy": abstract})[0]["policy"]["params"]
+    policies = [load_policy(finished[0], session).params]
     evaluator = session.evaluator()
-    placements = session.placements("heldout", config.eval.goals)
-    first = evaluator.run(params, placements, (0, 1), seed=0)
-    again = evaluator.run(params, placements, (1,), seed=0)
+    trial = session.trial("heldout", config.eval.goals)
+    first = evaluator.run(policies, trial, (0, 1), seed=0)
+    again = evaluator.run(policies, trial, (1,), seed=0)
     np.testing.assert_array_equal(first[1].returns, again[1].returns)
-    other = evaluator.run(params, placements, (1,), seed=1)
+    other = evaluator.run(policies, trial, (1,), seed=1)
     assert not np.array_equal(first[1].returns, other[1].returns)  # z is drawn
     # One goal a task in a padded batch scores as it does among others.
-    alone = evaluator.run(params, placements[:, :1], (1,), seed=0)
-    np.testing.assert_allclose(alone[1].returns[:, 0], first[1].returns[:, 0], rtol=1e-4)
+    alone = evaluator.run(policies, trial.of_goal(0), (1,), seed=0)
+    np.testing.assert_allclose(alone[1].returns[:, :, 0], first[1].returns[:, :, 0], rtol=1e-4)
 
 
 PRESETS = ("ml4", "pearl", "cmrl-paper", "mtsac", "sac", "ml4-large")

@@ -1,0 +1,91 @@
+"""`train.py finetune`: restores a run whole, adapts it in each way asked for, writes the curves."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from cmrl_jax.checkpoint import full_store, split_run
+from cmrl_jax.collect import init_run
+from cmrl_jax.config import Config
+from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.finetune import FineTuning, Score, adaptation_curve, training_denominator
+from cmrl_jax.finetune_flags import FinetuneOptions, check_run
+from cmrl_jax.goals import load_goals
+from cmrl_jax.learner import TrainState
+from cmrl_jax.metrics import package_versions
+from cmrl_jax.session import Session, prepare_jax
+
+Curves = dict[str, dict[int, Score]]
+
+
+def finetune_run(
+    run: Path, options: FinetuneOptions, json_path: Path | None, figure: Path | None
+) -> int:
+    """Adapts a run's last full checkpoint to a task; returns the exit code.
+
+    Raises:
+        ConfigError: no checkpoint, or the run cannot be adapted so.
+    """
+    config = resolve(*read_yaml(run / "config.yaml"))
+    check_run(config, options)
+    print(f"device: {prepare_jax(config)}", flush=True)
+    session = Session(config)
+    trained, meta = load_learner(run, config, session)
+    text = load_goals(config.goals.table, (options.task,)).vectors[0, 0]
+    placements = session.placements(options.goal_set, options.goals, (options.task,))[0]
+    placements = np.asarray(placements, np.float32)
+    denominator = training_denominator(config, trained)
+    print(
+        f"checkpoint {meta['iteration']} of {run}, {options.task}: own episodes, success any/last"
+    )
+    curves: Curves = {}
+    for adapt in options.adapt:
+        tuning = FineTuning(config, adapt, options.task, trained, text, denominator, options)
+        curves[adapt] = adaptation_curve(
+            tuning, options, placements, lambda n, score, adapt=adapt: _say(adapt, n, score)
+        )
+        if json_path is not None:  # after each way: a stopped command keeps what it has
+            result = as_json(curves) | asdict(options) | {"run": run.as_posix()}
+            result |= {"iteration": meta["iteration"], "versions": package_versions()}
+            json_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    if figure is not None:
+        from cmrl_jax.plots import plot_adaptation
+
+        plot_adaptation(as_json(curves)["curves"], options.task, figure)
+    return 0
+
+
+def load_learner(run: Path, config: Config, session: Session) -> tuple[TrainState, dict[str, Any]]:
+    """The learner's state of a run's newest full checkpoint, and the checkpoint's record."""
+    init = lambda key: init_run(config, session.learner, key)
+    abstract = jax.eval_shape(init, jax.random.key(0))
+    with full_store(run, read_only=True) as store:
+        trees, meta = store.restore(split_run(abstract), config, versions=package_versions())
+    return trees["learner"]["state"], meta
+
+
+def as_json(curves: Curves) -> dict[str, Any]:
+    """`{"curves": {adapt: {episodes: {"success_any": .., "success_last": .., "return": ..}}}}`."""
+    figures = {
+        adapt: {
+            str(n): {
+                "success_any": score.success_any,
+                "success_last": score.success_last,
+                "return": score.returns,
+            }
+            for n, score in curve.items()
+        }
+        for adapt, curve in curves.items()
+    }
+    return {"curves": figures}
+
+
+def _say(adapt: str, episodes: int, score: Score) -> None:
+    figures = f"{score.success_any:.2f} / {score.success_last:.2f}  return {score.returns:.0f}"
+    print(f"{adapt:<10} {episodes:>5}  {figures}", flush=True)

@@ -1,0 +1,103 @@
+"""Flags of `train.py finetune`, and what they mean; read and checked before jax is imported."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+from cmrl_jax.config import TASKS, Config, ConfigError, suggest
+from cmrl_jax.validate import check_goal_set
+
+DESCRIPTION = "Adapts a trained policy to a task it never saw, with gradient steps on its own data."
+# What gradient steps may change; `posterior`: nothing, `scratch`: SAC that begins from nothing.
+ADAPT = ("posterior", "z", "router", "all", "scratch")
+READ_OUTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+
+
+@dataclass(frozen=True)
+class FinetuneOptions:
+    """What `finetune` was asked for.
+
+    Attributes:
+        task: the task to adapt to.
+        adapt: ways to adapt, each from the same checkpoint.
+        episodes: of own experience.
+        updates: gradient steps a control step.
+        goals: of a read-out, the first of `goal_set`.
+        seed: of the own episodes, and of the read-outs' draws.
+        physics: backend; None for the run's own.
+    """
+
+    task: str
+    adapt: tuple[str, ...] = ADAPT
+    episodes: int = 100
+    updates: int = 1
+    goals: int = 50
+    goal_set: str = "heldout"
+    seed: int = 0
+    physics: str | None = None
+
+    @property
+    def read_outs(self) -> tuple[int, ...]:
+        """Episodes after which the policy is scored; the last always is."""
+        early = [n for n in READ_OUTS if n < self.episodes]
+        return (*early, self.episodes)
+
+
+def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Adds the flags of `finetune`."""
+    add = parser.add_argument
+    add("--run", metavar="DIR", type=Path, required=True, help="run directory, with its ckpt/")
+    add("--task", metavar="T", required=True, help="task to adapt to, as window-close")
+    add("--adapt", default=",".join(ADAPT), metavar="A,B", help=f"[{','.join(ADAPT)}]")
+    add("--episodes", type=int, default=100, metavar="N", help="episodes of own experience [100]")
+    add("--updates", type=int, default=1, metavar="N", help="gradient steps a control step [1]")
+    add("--goals", type=int, default=50, metavar="N", help="goals of a read-out, 1 to 50 [50]")
+    add("--goal-set", default="heldout", metavar="SET", help="train, heldout or fresh:<seed>")
+    add("--seed", type=int, default=0, metavar="S", help="of episodes and read-outs [0]")
+    add("--physics", choices=("mjx", "native"), metavar="P", help="mjx, native [the run's own]")
+    add("--json", type=Path, metavar="F", help="write the figures to this file")
+    add("--figure", type=Path, metavar="F", help="draw the curves to this PNG")
+    return parser
+
+
+def options_of(args: argparse.Namespace) -> FinetuneOptions:
+    """The options of parsed flags.
+
+    Raises:
+        ConfigError: a flag that cannot be.
+    """
+    if args.task not in TASKS:
+        cure = f"{suggest(args.task, TASKS)}tasks: {', '.join(TASKS)}"
+        raise ConfigError(f"unknown task '{args.task}'", cure)
+    adapt = tuple(word.strip() for word in args.adapt.split(",") if word.strip())
+    for word in adapt or ("",):
+        if word not in ADAPT:
+            raise ConfigError(f"--adapt '{word}' is no way to adapt", f"use: {', '.join(ADAPT)}")
+    for name, low in (("episodes", 1), ("updates", 1), ("goals", 1), ("seed", 0)):
+        if (value := getattr(args, name)) < low:
+            raise ConfigError(f"--{name} is {value}", f"give {low} or more")
+    if args.goals > 50:
+        raise ConfigError(f"--goals is {args.goals}", "give 1 to 50: a goal set has 50 a task")
+    check_goal_set(args.goal_set, "--goal-set")
+    fields = ("task", "episodes", "updates", "goals", "goal_set", "seed", "physics")
+    return FinetuneOptions(adapt=adapt, **{name: getattr(args, name) for name in fields})
+
+
+def check_run(config: Config, options: FinetuneOptions) -> None:
+    """Whether a run can be adapted so.
+
+    Raises:
+        ConfigError: it was trained on the task, or has no part of that name.
+    """
+    if options.task in config.tasks.train:
+        held = [task for task in TASKS if task not in config.tasks.train]
+        cause = f"the run was trained on {options.task}"
+        raise ConfigError(cause, f"give --task one of: {', '.join(held) or 'none is left'}")
+    has = {"z": config.model.conditioning == "z", "router": config.model.net == "soft"}
+    has["posterior"] = has["z"]
+    if missing := [word for word in options.adapt if not has.get(word, True)]:
+        left = [word for word in options.adapt if word not in missing]
+        cause = f"--adapt {missing[0]}: the run has no {missing[0]}"
+        raise ConfigError(cause, f"use --adapt {','.join(left) or 'all,scratch'}")

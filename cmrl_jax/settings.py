@@ -1,0 +1,72 @@
+"""What an evaluation was taken with: as CSV columns, as JSON fields, in words."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from cmrl_jax.config import Config
+from cmrl_jax.evaluate_flags import EvalOptions
+from cmrl_jax.metrics import package_versions
+
+
+def horizon_of(options: EvalOptions, config: Config) -> int:
+    """Control steps of an episode."""
+    return options.horizon or config.env.horizon
+
+
+def settings(options: EvalOptions, config: Config) -> dict[str, Any]:
+    """The columns `scores.SETTINGS`: what a figure was taken with, the checkpoint apart."""
+    return {
+        "physics": options.physics or config.env.physics,
+        "horizon": horizon_of(options, config),
+        "goal_set": options.goal_set,
+        "policy": options.policy,
+        "z": options.z,
+        "paraphrases": options.paraphrases,
+        "text_control": options.text_control,
+        "text": options.text,
+        "eval_seed": options.seed,
+    }
+
+
+def row_columns(
+    run: Path, meta: dict[str, Any], options: EvalOptions, config: Config
+) -> dict[str, Any]:
+    """The columns that all CSV rows of a checkpoint share."""
+    facts = {"config": config.name, "train_seed": config.seed, "env_steps": meta["env_steps"]}
+    cell = {"run": run.as_posix(), "checkpoint": meta["iteration"]}
+    return cell | facts | settings(options, config)
+
+
+def result_fields(
+    run: Path, meta: dict[str, Any], options: EvalOptions, config: Config
+) -> dict[str, Any]:
+    """What stands beside the figures in an evaluation's JSON."""
+    fields = settings(options, config)
+    return {
+        "goals": options.goals,
+        "draws": options.draws,
+        "seed": fields.pop("eval_seed"),
+        **fields,
+        "run": run.as_posix(),
+        "iteration": meta["iteration"],
+        "env_steps": meta["env_steps"],
+        "train_tasks": list(config.tasks.train),
+        "test_tasks": list(config.tasks.test),
+        "config": config.name,
+        "train_seed": config.seed,
+        "versions": package_versions(),
+    }
+
+
+def describe(options: EvalOptions, config: Config) -> str:
+    """The settings of an evaluation in words; those that are the protocol's are left out."""
+    where = f"{options.goals} goals of '{options.goal_set}', horizon {horizon_of(options, config)}"
+    words = [where, f"seed {options.seed}", options.physics or config.env.physics]
+    usual = asdict(EvalOptions())
+    for name in ("draws", "policy", "z", "paraphrases", "text_control", "text"):
+        if (value := getattr(options, name)) != usual[name]:
+            words.append(f"{name.replace('_', ' ')} {value}")
+    return ", ".join(words)

@@ -1,0 +1,133 @@
+"""Flags of `eval` and `sweep`: what they hand on, and their mistakes."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import cmrl_jax
+from cmrl_jax.cli import main
+from cmrl_jax.config_io import load_config, to_yaml
+from cmrl_jax.evaluate_flags import EvalOptions
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def calls(here, monkeypatch):
+    """Puts recorders in place of the two programs; returns the list of their keywords."""
+    made = []
+    record = lambda **kwargs: made.append(kwargs) or 0
+    for module, function in (("evaluate_cli", "evaluate_run"), ("sweep", "sweep")):
+        fake = SimpleNamespace(**{function: record})
+        monkeypatch.setitem(sys.modules, f"cmrl_jax.{module}", fake)
+        monkeypatch.setattr(cmrl_jax, module, fake, raising=False)
+    return made
+
+
+def make_run(path: Path, config: str = "ml4.yaml") -> None:
+    path.mkdir(parents=True)
+    (path / "config.yaml").write_text(to_yaml(load_config(config)))
+
+
+@pytest.mark.parametrize(
+    ("words", "cause", "cure"),
+    [
+        (["eval"], "required: --run", "--help"),
+        (["eval", "--run", "nope"], "run directory nope does not exist", "train"),
+        (["eval", "--run", "x", "--k", "0,a"], "--k: invalid", "--help"),
+        (["eval", "--run", "x", "--k", "0,-1"], "--k: invalid", "--help"),
+        (["eval", "--run", "x", "--goals", "51"], "--goals is 51", "1 to 50"),
+        (["eval", "--run", "x", "--horizon", "0"], "--horizon is 0", "at least one"),
+        (["eval", "--run", "x", "--goal-set", "hldout"], "'hldout'", "did you mean 'heldout'?"),
+        (["eval", "--run", "x", "--lanes", "0"], "--lanes is 0", "at least one"),
+        (["eval", "--run", "x", "--eval-seeds", "0"], "--eval-seeds is 0", "at least one"),
+        (["eval", "--run", "x", "--tasks", "window-opn"], "unknown task", "'window-open'?"),
+        (["eval", "--run", "x", "--tasks", "a,"], "unknown task 'a'", "valid: drawer-open"),
+        (["eval", "--run", "x", "--k", "1,1"], "--k is '1,1'", "each once"),
+        (["eval", "--run", "x", "--z", "no"], "--z: invalid choice", "--help"),
+        (
+            ["eval", "--run", "x", "--text", "shut it", "--paraphrases", "heldout"],
+            "--text with --paraphrases",
+            "one of the two",
+        ),
+        (
+            ["eval", "--run", "x", "--z", "other", "--physics", "metaworld"],
+            "--z other with --physics metaworld",
+            "--z posterior",
+        ),
+        (["sweep"], "required: --runs", "--help"),
+        (["sweep", "--runs", "x*"], "--runs x* matches no run", "runs/ml4-*"),
+        (["sweep", "--runs", "x", "--checkpoints", "first"], "--checkpoints is 'first'", "all"),
+        (["sweep", "--runs", "x", "--physics", "metaworld"], "--physics: invalid", "--help"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_mistake_is_one_cause_and_one_cure(refused, here, words, cause, cure):
+    got = refused(*words)
+    assert cause in got[0] and cure in got[1]
+    assert not list(here.iterdir())  # nothing was begun
+
+
+PROTOCOL = [
+    "--k", "0,1,5", "--tasks", "window-close,drawer-open", "--goals", "4", "--goal-set", "fresh:7",
+    "--eval-seeds", "3", "--seed", "2", "--horizon", "500", "--physics", "native",
+    "--policy", "sampled", "--z", "shuffled", "--paraphrases", "heldout",
+    "--text-control", "shuffled", "--any-table", "--lanes", "64",
+]  # fmt: skip
+OPTIONS = EvalOptions(
+    k=(0, 1, 5), tasks=("window-close", "drawer-open"), goals=4, goal_set="fresh:7", draws=3,
+    seed=2, horizon=500, physics="native", policy="sampled", z="shuffled", paraphrases="heldout",
+    text_control="shuffled", any_table=True, lanes=64,
+)  # fmt: skip
+
+
+def test_eval_hands_over_its_flags(calls, here):
+    make_run(here / "r")
+    files = ["--checkpoint", "12", "--json", "out/f.json", "--csv", "out/f.csv"]
+    assert main(["eval", "--run", "r", *PROTOCOL, *files]) == 0
+    assert main(["eval", "--run", "r"]) == 0
+    text = ["--text", "shut it", "--weights", "w"]
+    assert main(["eval", "--run", "r", *text]) == 0
+    assert calls[0] == {
+        "run": Path("r"), "options": OPTIONS, "checkpoint": 12,
+        "json_path": Path("out/f.json"), "csv_path": Path("out/f.csv"),
+    }  # fmt: skip
+    assert calls[1] == {
+        "run": Path("r"), "options": EvalOptions(), "checkpoint": None,
+        "json_path": None, "csv_path": None,
+    }  # fmt: skip
+    assert calls[2]["options"] == EvalOptions(text="shut it", weights=Path("w"))
+    assert list((here / "out").iterdir()) == []  # tried, and left to the command to write
+
+
+def test_sweep_hands_over_its_flags(calls, refused, here):
+    for name in ("a-2", "a-1", "b"):
+        make_run(here / "runs" / name)
+    (here / "runs" / "a-3").mkdir()  # holds no run
+    patterns = ["--runs", "runs/b", "runs/a-*", "runs/*"]
+    files = ["--json", "f.json", "--csv", "f.csv", "--compare", "8"]
+    assert main(["sweep", *patterns, "--checkpoints", "20,40", *PROTOCOL, *files]) == 0
+    assert main(["sweep", "--runs", "runs/b"]) == 0
+    assert calls[0] == {
+        "runs": [Path("runs/b"), Path("runs/a-1"), Path("runs/a-2")], "checkpoints": (20, 40),
+        "options": OPTIONS, "json_path": Path("f.json"), "csv_path": Path("f.csv"), "compare": 8,
+    }  # fmt: skip
+    assert calls[1] == {
+        "runs": [Path("runs/b")], "checkpoints": "last", "options": EvalOptions(),
+        "json_path": None, "csv_path": None, "compare": 0,
+    }  # fmt: skip
+    make_run(here / "runs" / "m", "mtsac.yaml")
+    assert "(runs/m)" in refused("sweep", "--runs", "runs/*", "--k", "0,1")[0]
+
+
+def test_eval_without_a_latent_does_not_adapt(calls, refused, here):
+    make_run(here / "r", "mtsac.yaml")
+    assert "--k 0,2" in refused("eval", "--run", "r", "--k", "0,2")[0]
+    assert main(["eval", "--run", "r"]) == 0  # the run's own final_k is 0

@@ -1,0 +1,153 @@
+"""Means, intervals and the CSV of cells, without any physics."""
+
+import csv
+import math
+
+import numpy as np
+import pytest
+
+from cmrl_jax.config import ConfigError
+from cmrl_jax.episode import Episode
+from cmrl_jax.scores import (
+    CELL,
+    COLUMNS,
+    FIGURES,
+    ScoreCsv,
+    bootstrap_interval,
+    cell_rows,
+    format_scores,
+    of_policy,
+    summarise,
+    summarise_rows,
+)
+
+TASKS = ("window-open", "window-close")
+COMMON = {
+    "run": "runs/a", "checkpoint": 20, "config": "cmrl", "train_seed": 0, "env_steps": 9,
+    "physics": "mjx", "horizon": 200, "goal_set": "heldout", "policy": "deterministic",
+    "z": "posterior", "paraphrases": "train", "text_control": "none", "text": None, "eval_seed": 0,
+}  # fmt: skip
+
+
+def episode(seed, shape=(2, 2, 5, 3)):
+    """An Episode of random scores (policy, task, goal, draw)."""
+    generator = np.random.default_rng(seed)
+    number = lambda: generator.normal(100, 20, shape).astype(np.float32)
+    flag = lambda: generator.random(shape) < 0.6
+    step = generator.integers(0, 200, shape)
+    fields = (flag(), flag(), number(), step, number(), np.zeros(shape, np.int32))
+    return Episode(*fields)  # pyright: ignore[reportArgumentType]
+
+
+def assert_summaries_agree(found, wanted):
+    """Equal but for rounding: {task: {k: {figure: mean, "interval_95": {figure: [..]}}}}."""
+    assert found.keys() == wanted.keys()
+    for task, by_k in wanted.items():
+        assert found[task].keys() == by_k.keys()
+        for k, figures in by_k.items():
+            got = dict(found[task][k])
+            assert got.pop("interval_95").keys() == figures["interval_95"].keys()
+            for name, interval in figures["interval_95"].items():
+                np.testing.assert_allclose(
+                    found[task][k]["interval_95"][name], interval, rtol=1e-5, err_msg=name
+                )
+            means = {name: value for name, value in figures.items() if name != "interval_95"}
+            assert got == pytest.approx(means, rel=1e-5)
+
+
+SCORES = {0: episode(0), 2: episode(1)}
+
+
+def test_means_over_goals_and_draws():
+    summary = summarise(of_policy(SCORES, 1), TASKS)
+    assert list(summary) == list(TASKS) and list(summary["window-open"]) == ["0", "2"]
+    figures = summary["window-close"]["2"]
+    own = SCORES[2]
+    assert figures["success_any"] == pytest.approx(own.success_any[1, 1].mean())
+    assert figures["return"] == pytest.approx(own.returns[1, 1].mean(), rel=1e-6)
+    assert figures["first_success_step"] == pytest.approx(own.first_success[1, 1].mean())
+    low, high = figures["interval_95"]["success_any"]
+    assert low < figures["success_any"] < high
+
+
+def test_the_interval_is_the_binomials():
+    """50 goals with 40 successes: the sampling distribution of the mean is known exactly."""
+    values = np.r_[np.ones(40), np.zeros(10)]
+    cdf = np.cumsum([math.comb(50, n) * 0.8**n * 0.2 ** (50 - n) for n in range(51)])
+    exact = [np.searchsorted(cdf, q) / 50 for q in (0.025, 0.975)]
+    np.testing.assert_allclose(bootstrap_interval(values), exact, atol=0.021)
+    assert bootstrap_interval(values) == bootstrap_interval(values)  # no draw of the clock's
+    assert bootstrap_interval(np.ones(50)) == [1.0, 1.0]
+    assert bootstrap_interval(np.ones(1)) == [1.0, 1.0]
+
+
+def test_draws_of_a_goal_do_not_count_as_goals():
+    """The interval is over goals: repeating every draw must not shrink it."""
+    one = {0: episode(0, (2, 5, 1))}
+    many = {0: Episode(*(np.repeat(x, 10, axis=-1) for x in one[0]))}  # pyright: ignore[reportArgumentType]
+    assert_summaries_agree(summarise(one, TASKS), summarise(many, TASKS))
+
+
+def test_the_table_names_every_task_and_k():
+    lines = format_scores(summarise(of_policy(SCORES, 0), TASKS)).splitlines()
+    assert [line.split()[:2] for line in lines[1:]] == [[t, k] for t in TASKS for k in "02"]
+    success = SCORES[0].success_any[0, 0].mean()
+    assert f"{success:.2f}" in lines[1]
+
+
+def test_rows_hold_every_figure(tmp_path):
+    path = tmp_path / "s.csv"
+    with ScoreCsv(path, resume=False) as table:
+        table.add(cell_rows(of_policy(SCORES, 1), TASKS, COMMON))
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS and len(rows) == 2 * 5 * 3 * 2
+    for row in rows:
+        k, task, goal, draw = (row[name] for name in ("k", "task", "goal", "draw"))
+        place = (1, TASKS.index(task), int(goal), int(draw))
+        for column, field in FIGURES.items():
+            assert np.float32(row[column]) == np.float32(getattr(SCORES[int(k)], field)[place])
+        assert (row["run"], row["checkpoint"], row["text"]) == ("runs/a", "20", "")
+    wanted = summarise(of_policy(SCORES, 1), TASKS)
+    assert_summaries_agree(summarise_rows(rows), wanted)
+
+
+def cell(row):
+    return {name: row[name] for name in (*CELL, *COMMON) if name in row}
+
+
+def test_a_file_is_gone_on_with(tmp_path):
+    path = tmp_path / "s.csv"
+    rows = cell_rows(of_policy(SCORES, 0), TASKS, COMMON)
+    with ScoreCsv(path, resume=True) as table:  # nothing there yet
+        table.add(rows[:7])
+    whole = path.read_bytes()
+    path.write_bytes(whole + b"runs/a,20,window-open,4")  # killed while it wrote
+    with ScoreCsv(path, resume=True) as table:
+        assert [table.holds(cell(row)) for row in rows[:9]] == [True] * 7 + [False] * 2
+        assert not table.holds(cell(rows[0]) | {"horizon": 500})  # another setting, another cell
+        assert not table.holds(cell(rows[0]) | {"run": "runs/b"})
+        table.add(rows)
+    assert path.read_bytes().startswith(whole)
+    with ScoreCsv(path, resume=True) as table:
+        assert table.rows({}) == rows
+    assert path.read_text().count("\n") == 1 + len(rows)  # each once
+    with ScoreCsv(path, resume=False) as table:
+        assert table.rows({}) == [] and path.read_text().count("\n") == 1
+
+
+def test_rows_of_one_checkpoint(tmp_path):
+    table = ScoreCsv(None, resume=True)
+    for checkpoint in (20, 40):
+        common = COMMON | {"checkpoint": checkpoint}
+        table.add(cell_rows(of_policy(SCORES, 0), TASKS, common))
+    assert len(table.rows({"checkpoint": 40, "text": None})) == 60
+    assert {r["checkpoint"] for r in table.rows({"checkpoint": 40})} == {"40"}
+
+
+def test_a_foreign_file_is_not_overwritten(tmp_path):
+    path = tmp_path / "s.csv"
+    path.write_text("iteration,env_steps\n0,1\n")
+    with pytest.raises(ConfigError, match="does not hold the columns"):
+        ScoreCsv(path, resume=True)
+    assert path.read_text() == "iteration,env_steps\n0,1\n"

@@ -1,0 +1,188 @@
+"""Sweeps over runs of random policies on native physics, six control steps an episode."""
+
+import csv
+import json
+
+import pytest
+from policy_fixtures import save_run, small_config
+
+from cmrl_jax import sweep as sweep_module
+from cmrl_jax.cli import main
+from cmrl_jax.evaluate import Evaluator
+from cmrl_jax.session import Session
+from cmrl_jax.sweep import INTERRUPTED
+from cmrl_jax.trials import Plan, fitted, plan_batches
+
+GOALS, KS, TASKS = 3, ("0", "2"), 4
+PROTOCOL = ["--goals", str(GOALS), "--k", ",".join(KS)]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs of one program, with two and one checkpoints, and one of another, with one."""
+    folder = tmp_path_factory.mktemp("runs")
+    held_out = {"tasks.train": "[window-close, drawer-close, window-open]"}
+    held_out |= {"tasks.test": "[drawer-open]", "seed": "1"}
+    save_run(folder / "a", Session(small_config()), seeds=(1, 2))
+    save_run(folder / "b", Session(small_config(**held_out)), seeds=(3,))
+    save_run(folder / "c", Session(small_config(**{"model.net": "mlp"})), seeds=(4,))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def swept(runs):
+    """A finished sweep -> its rows by cell, its JSON, and the memory of each program compiled."""
+    memory = []
+    compile_, memory_bytes = Evaluator.compile, Evaluator.memory_bytes
+
+    def recorded(self, params, width):
+        if not self.is_compiled:
+            compile_(self, params, width)
+            memory.append((self.policies * self.lanes, memory_bytes(self)))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Evaluator, "compile", recorded)
+        assert sweep(runs, runs / "s.csv", "--json", str(runs / "s.json")) == 0
+    return read(runs / "s.csv"), json.loads((runs / "s.json").read_text()), memory
+
+
+def sweep(runs, csv_path, *words):
+    own = ["--csv", str(csv_path)] if csv_path else []
+    return main(["sweep", "--runs", f"{runs}/?", "--checkpoints", "all", *PROTOCOL, *own, *words])
+
+
+def read(path):
+    """{(run, checkpoint, task, goal, draw, k): row}; every cell stands there once."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    cells = {
+        tuple(r[c] for c in ("run", "checkpoint", "task", "goal", "draw", "k")): r for r in rows
+    }
+    assert len(cells) == len(rows)
+    return cells
+
+
+def test_every_cell_has_a_row(runs, swept):
+    cells, result, memory = swept
+    assert len(cells) == 4 * TASKS * GOALS * len(KS) == result["cells"]
+    targets = {(key[0], key[1]) for key in cells}
+    named = {
+        (str(runs / run), step) for run, step in (("a", "1"), ("a", "2"), ("b", "1"), ("c", "1"))
+    }
+    assert targets == named
+    assert [(e["run"], e["iteration"]) for e in result["evaluations"]] == [
+        (str(runs / run), step) for run, step in (("a", 1), ("a", 2), ("b", 1), ("c", 1))
+    ]
+    # Checkpoints of one program share it, whatever their tasks are.
+    assert sorted(lanes for lanes, _ in memory) == [12, 36]
+    assert 0 < dict(memory)[12] < dict(memory)[36]
+
+
+def test_figures_are_those_of_eval(runs, swept, tmp_path):
+    """Stacked with others and in another order of tasks, a checkpoint scores as it does alone."""
+    _, result, _ = swept
+    for found in result["evaluations"][1:3]:
+        words = ["--checkpoint", str(found["iteration"]), "--json", str(tmp_path / "e.json")]
+        assert main(["eval", "--run", found["run"], *PROTOCOL, *words]) == 0
+        alone = json.loads((tmp_path / "e.json").read_text())
+        assert {k: v for k, v in found.items() if k != "tasks"} == {
+            k: v for k, v in alone.items() if k != "tasks"
+        }
+        assert set(found["tasks"]) == set(alone["tasks"])
+        for task, by_k in alone["tasks"].items():
+            assert list(found["tasks"][task]) == list(by_k) == list(KS)
+            for k, figures in by_k.items():
+                assert found["tasks"][task][k]["return"] == pytest.approx(figures["return"], 1e-4)
+
+
+def test_a_stopped_sweep_goes_on_and_runs_no_cell_twice(runs, swept, tmp_path, monkeypatch):
+    path, calls = tmp_path / "s.csv", []
+    original = Evaluator.run
+
+    def recorded(self, policies, trial, k, seed):
+        if len(calls) == stop_at:
+            raise KeyboardInterrupt
+        calls.append(len(policies) * len(trial.tasks))
+        return original(self, policies, trial, k, seed)
+
+    monkeypatch.setattr(Evaluator, "run", recorded)
+    small = ["--lanes", str(2 * GOALS)]  # two checkpoints, one task a batch
+    stop_at = 3
+    assert sweep(runs, path, *small) == INTERRUPTED
+    first = read(path)
+    assert len(first) == sum(calls) * GOALS * len(KS) == 6 * GOALS * len(KS)
+    path.write_bytes(path.read_bytes()[:-5])  # and the last row only half written
+    stop_at = None
+    assert sweep(runs, path, *small) == 0
+    wanted = swept[0]
+    assert sum(calls) == 4 * TASKS + 1  # each (checkpoint, task) once, and the torn one again
+    found = read(path)
+    assert found.keys() == wanted.keys()
+    for cell, row in wanted.items():
+        assert float(found[cell]["return"]) == pytest.approx(float(row["return"]), 1e-4)
+    calls.clear()
+    assert sweep(runs, path, *small) == 0
+    assert calls == [] and read(path) == found
+
+
+def test_other_settings_are_other_cells(runs, tmp_path):
+    path = tmp_path / "s.csv"
+    words = ["--runs", str(runs / "a"), *PROTOCOL, "--csv", str(path)]
+    assert main(["sweep", *words]) == 0
+    assert main(["sweep", *words, "--z", "shuffled"]) == 0
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["z"] for row in rows].count("shuffled") == len(rows) / 2 == TASKS * GOALS * 2
+    assert {row["checkpoint"] for row in rows} == {"2"}  # the last
+
+
+def test_short_memory_makes_smaller_batches(runs, swept, monkeypatch, capsys):
+    needed = []
+
+    def memory(self):
+        needed.append(self.policies * self.lanes)
+        return 1000 * self.policies * self.lanes
+
+    monkeypatch.setattr(Evaluator, "memory_bytes", memory)
+    monkeypatch.setattr(sweep_module, "memory_limit", lambda: 7000)
+    assert sweep(runs, None, "--json", str(runs / "small.json")) == 0
+    assert "memory is short" in capsys.readouterr().out
+    assert max(needed) == 36 and needed.count(7) == 2
+    small = json.loads((runs / "small.json").read_text())["evaluations"]
+    for a, b in zip(small, swept[1]["evaluations"], strict=True):
+        for task in a["tasks"]:
+            returns = [e["tasks"][task]["2"]["return"] for e in (a, b)]
+            assert returns[0] == pytest.approx(returns[1], 1e-4)
+
+
+def test_compare_takes_the_same_cells_one_by_one(runs, tmp_path):
+    path = tmp_path / "c.json"
+    assert sweep(runs, None, "--compare", "5", "--json", str(path)) == 0
+    found = json.loads(path.read_text())["one_by_one"]
+    assert found["cells"] == 5 * len(KS) == found["equal_success"]
+    assert found["largest_return_difference"] < 1e-3
+    assert found["ratio"] == pytest.approx(found["sweep_cells_per_s"] / found["cells_per_s"])
+
+
+def test_missing_checkpoints_are_named(runs, refused, tmp_path):
+    words = ["--runs", f"{runs}/?", "--checkpoints"]
+    cause, cure = refused("sweep", *words, "1,2", *PROTOCOL)
+    assert cause == f"{runs / 'b'} has no checkpoint 2" and cure == "there are: 1"
+    run = save_run(tmp_path / "none", Session(small_config()), seeds=())
+    assert "no policy checkpoint" in refused("sweep", "--runs", str(run))[0]
+
+
+def test_plans():
+    assert plan_batches(4, tasks=4, per_task=50, budget=8192) == Plan(4, 200)
+    assert plan_batches(4, tasks=4, per_task=50, budget=256) == Plan(4, 50)
+    assert plan_batches(20, tasks=4, per_task=50, budget=256) == Plan(5, 50)
+    assert plan_batches(1, tasks=4, per_task=50, budget=256) == Plan(1, 200)
+    assert plan_batches(4, tasks=1, per_task=250, budget=100) == Plan(1, 100)
+    for policies, lanes, needed in ((4, 50, 1100), (1, 50, 3000), (9, 7, 10**6)):
+        plan = Plan(policies, lanes)
+        assert fitted(plan, needed, None) == fitted(plan, 1000, 1000) == plan
+        smaller = fitted(plan, needed, 1000)
+        size = smaller.policies * smaller.lanes
+        assert 1 <= size < policies * lanes
+        assert size <= policies * lanes * 1000 / needed or smaller.policies == 1
+    assert fitted(Plan(1, 2), 10**9, 1) == Plan(1, 1)
