@@ -233,6 +233,24 @@ def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
     return CheckpointStore(run / "policy", POLICY_ITEMS, None, read_only)
 
 
+def split_run(run: Any) -> dict[str, Any]:
+    """The items of `full_store` that hold a `collect.RunState`, or the shapes of one."""
+    learner = {"state": run.learner, "key": run.key, "iteration": run.iteration}
+    return {"learner": learner, "replay": run.replay, "context": run.context}
+
+
+def join_run(run: Any, items: Mapping[str, Any]) -> Any:
+    """The inverse of `split_run`, with the type of `run`."""
+    learner = items["learner"]
+    return run.replace(
+        learner=learner["state"],
+        key=learner["key"],
+        iteration=learner["iteration"],
+        replay=items["replay"],
+        context=items["context"],
+    )
+
+
 def _nothing_saved(directory: Path) -> ConfigError:
     cure = "name a run that has saved one with --run DIR, or train without --resume"
     return ConfigError(f"no checkpoint in {directory}", cure)

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from cmrl_jax.checkpoint import full_store, policy_store
+from cmrl_jax.checkpoint import full_store, join_run, policy_store, split_run
 from cmrl_jax.collect import (
     RunState,
     init_run,
@@ -145,17 +145,10 @@ class _Run:
         config = self.config
         if resume and self.full.steps():
             trees, meta = self.full.restore(
-                self.trees(abstract), config=config, versions=package_versions()
+                split_run(abstract), config=config, versions=package_versions()
             )
             self.check_goals(meta)
-            learner = trees["learner"]
-            self.state = RunState(
-                learner=learner["state"],
-                replay=trees["replay"],
-                context=trees["context"],
-                key=learner["key"],
-                iteration=learner["iteration"],
-            )
+            self.state = join_run(abstract, trees)
             self.done, self.wall = meta["iteration"], meta["wall_s"]
             self.csv = MetricsCsv(csv_path, columns, offset=meta["csv_offset"])
             self.say(f"resuming {self.run_dir} after iteration {self.done}")
@@ -268,10 +261,6 @@ class _Run:
         share = self.share_done()
         return self.wall * max(1 / share - 1, 0.0) if share else math.inf
 
-    def trees(self, state: RunState) -> dict[str, Any]:
-        learner = {"state": state.learner, "key": state.key, "iteration": state.iteration}
-        return {"learner": learner, "replay": state.replay, "context": state.context}
-
     def save(self) -> None:
         """A full checkpoint of this border, and a policy checkpoint where one is due."""
         self.saved_at = self.wall
@@ -284,7 +273,7 @@ class _Run:
             "versions": package_versions(),
             "goals_sha256": self.session.goals.sha256,
         }
-        self.full.save(self.trees(self.state), meta)
+        self.full.save(split_run(self.state), meta)
         is_last = self.stop.requested or not self.iterations_left()
         if self.done and (is_last or self.done % self.config.checkpoint.policy_every == 0):
             policy = {

@@ -32,7 +32,7 @@ def refused(capsys):
     return run
 
 
-# For the environment's tests; imported when asked for, since metaworld and mjx take seconds.
+# Imported when asked for, since metaworld and mjx take seconds.
 
 
 @pytest.fixture(scope="session")
@@ -49,3 +49,13 @@ def rollouts():
     from env_fixtures import record
 
     return record()
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """A finished native run of smoke.yaml, for whole runs to be compared with; do not change it."""
+    from run_helpers import native, smoke
+
+    run = tmp_path_factory.mktemp("undisturbed") / "run"
+    assert smoke(run, *native()) == 0
+    return run
