@@ -8,13 +8,12 @@ Each step holds a list of its files with their checksums, which is verified befo
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +69,7 @@ class CheckpointStore:
                 cause = f"cannot write checkpoints to {directory}: {error.strerror}"
                 cure = "give a run directory you may write to: --run DIR"
                 raise ConfigError(cause, cure) from error
+        _hush_orbax()
         options = ocp.CheckpointManagerOptions(
             preservation_policy=ocp.checkpoint_managers.LatestN(n=keep) if keep else None,
             cleanup_tmp_directories=not read_only,
@@ -79,10 +79,9 @@ class CheckpointStore:
             # The next iteration donates the buffers that a background thread would still read.
             enable_async_checkpointing=False,
         )
-        with _quiet_orbax():
-            self._manager = ocp.CheckpointManager(
-                self.directory, item_names=(*items, "meta"), options=options
-            )
+        self._manager = ocp.CheckpointManager(
+            self.directory, item_names=(*items, "meta"), options=options
+        )
 
     def steps(self) -> list[int]:
         """Iterations that can be restored, oldest first."""
@@ -120,8 +119,7 @@ class CheckpointStore:
         }
         args["meta"] = ocp.args.JsonSave(json.loads(json.dumps(meta)))
         try:
-            with _quiet_orbax():
-                self._manager.save(step, args=ocp.args.Composite(**args))
+            self._manager.save(step, args=ocp.args.Composite(**args))
             write_manifest(self.directory / str(step))
         except ValueError as error:  # what tensorstore makes of an error of the file system
             if code := re.search(r"os_error_code='(\d+)'", str(error)):
@@ -221,12 +219,10 @@ class CheckpointStore:
         """Deletes all later steps: the run goes on from `step` and will save them again."""
         for later in self.steps():
             if later > step:
-                with _quiet_orbax():
-                    self._manager.delete(later)
+                self._manager.delete(later)
 
     def close(self) -> None:
-        with _quiet_orbax():
-            self._manager.close()
+        self._manager.close()
 
     def __enter__(self) -> CheckpointStore:
         return self
@@ -247,8 +243,7 @@ class CheckpointStore:
 
     def _read(self, step: int, args: Mapping[str, Any]) -> Any:
         try:
-            with _quiet_orbax():
-                return self._manager.restore(step, args=ocp.args.Composite(**args))
+            return self._manager.restore(step, args=ocp.args.Composite(**args))
         except Exception as error:  # orbax, tensorstore and json each have their own classes
             raise self._damaged(step, f"{type(error).__name__}: {error}") from error
 
@@ -266,7 +261,7 @@ class CheckpointStore:
             saved = {}
             if path.exists():
                 try:
-                    with _quiet_orbax(), ocp.StandardCheckpointer() as reader:
+                    with ocp.StandardCheckpointer() as reader:
                         metadata = reader.metadata(path).item_metadata
                 except Exception as error:
                     raise self._damaged(step, f"{type(error).__name__}: {error}") from error
@@ -325,16 +320,23 @@ def _warn_of_versions(path: Path, saved: Mapping[str, Any], here: Mapping[str, A
         print(f"warning: {path} was written with {shown}", file=sys.stderr)
 
 
-@contextlib.contextmanager
-def _quiet_orbax() -> Iterator[None]:
-    """Orbax logs routine steps as warnings and failures, which are raised too, with tracebacks.
+def _hush_orbax() -> None:
+    """Drops orbax's own log lines (routine steps as warnings) and its stray complaints.
 
-    The level is put back for everyone else.
+    Failures are raised besides being logged. When one array fails, orbax closes its event loop
+    under the others, and each of them complains of that from a thread, where nobody can catch it.
     """
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+    logging.getLogger("absl").addFilter(_is_not_from_orbax)  # the same one is added once
+    report = sys.unraisablehook
+    if getattr(report, "__name__", "") == "drop_stragglers":
+        return
+
+    def drop_stragglers(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            report(unraisable)
+
+    sys.unraisablehook = drop_stragglers
+
+
+def _is_not_from_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in Path(record.pathname).parts

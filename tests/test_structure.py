@@ -29,6 +29,7 @@ ROWS = (
     {"learner"},
     {"losses", "objectives", "context", "replay"},
     {"networks", "layers", "distributions", "normalizers", "goals", "run_dir", "config_io"},
+    {"manifest", "named_arrays"},
     {"validate"},
     {"config"},
 )
