@@ -3,24 +3,26 @@
 Trees are stored flat, {path: array}, and rebuilt from an abstract tree: so None nodes, empty tuples
 and optax's named tuples survive, and a difference is reported by the name of the array. Saves are
 atomic (orbax writes a temporary directory and renames it): a kill leaves the previous step intact.
+Each step holds a list of its files with their checksums, which is verified before it is read.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
+import os
+import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import check_resumable
+from cmrl_jax.manifest import find_damage, write_manifest
+from cmrl_jax.named_arrays import describe, flatten, not_finite, placed, unflatten
 
 FULL_ITEMS = ("learner", "replay", "context")
 POLICY_ITEMS = ("policy",)
@@ -35,12 +37,15 @@ META_FIELDS = (
 )
 
 
+class DamagedCheckpoint(ConfigError):
+    """A checkpoint that cannot be read, or that is not what was saved."""
+
+
 class CheckpointStore:
     """The checkpoints in one directory, by iteration.
 
     A writer keeps the newest `keep` steps and removes what a killed save left behind; a reader
-    changes nothing, so it may look at a run that is still going on. Use as a context manager:
-    leaving it waits for the last save.
+    changes nothing, so it may look at a run that is still going on. Use as a context manager.
     """
 
     def __init__(
@@ -64,17 +69,19 @@ class CheckpointStore:
                 cause = f"cannot write checkpoints to {directory}: {error.strerror}"
                 cure = "give a run directory you may write to: --run DIR"
                 raise ConfigError(cause, cure) from error
+        _hush_orbax()
         options = ocp.CheckpointManagerOptions(
             preservation_policy=ocp.checkpoint_managers.LatestN(n=keep) if keep else None,
             cleanup_tmp_directories=not read_only,
             read_only=read_only,
             create=False,
             save_interval_steps=0 if read_only else 1,
+            # The next iteration donates the buffers that a background thread would still read.
+            enable_async_checkpointing=False,
         )
-        with _quiet_orbax():
-            self._manager = ocp.CheckpointManager(
-                self.directory, item_names=(*items, "meta"), options=options
-            )
+        self._manager = ocp.CheckpointManager(
+            self.directory, item_names=(*items, "meta"), options=options
+        )
 
     def steps(self) -> list[int]:
         """Iterations that can be restored, oldest first."""
@@ -83,14 +90,15 @@ class CheckpointStore:
     def save(self, trees: Mapping[str, Any], meta: Mapping[str, Any]) -> bool:
         """Store the trees as step `meta["iteration"]`; False if that step is stored already.
 
-        Returns as soon as the arrays are copied, files are written in the background: the trees
-        may be donated afterwards, and `wait` says when the step is safe.
+        Returns when the step is on disk, and only then are older ones deleted.
 
         Args:
             trees: one pytree of arrays for each item of the store; None for none.
             meta: exactly `META_FIELDS`, plain JSON data.
 
         Raises:
+            ConfigError: an array is not finite; nothing is written.
+            OSError: the disk is full, or refuses for another reason.
             ValueError: other items or fields than the store's, or an iteration before the last.
         """
         if set(trees) != set(self.items) or set(meta) != set(META_FIELDS):
@@ -100,14 +108,25 @@ class CheckpointStore:
             if step in saved:
                 return False
             raise ValueError(f"iteration {step} comes after {saved[-1]} was saved")
-        flat = {name: _flatten(tree) for name, tree in trees.items()}
+        flat = {name: flatten(tree) for name, tree in trees.items()}
+        for name, leaves in flat.items():
+            if bad := not_finite(leaves):
+                cause = f"iteration {step} is not saved: {name}/{bad} is not finite"
+                cure = f"start a new run with a lower sac.lr; {self.directory} keeps the one before"
+                raise ConfigError(cause, cure)
         args: dict[str, Any] = {
             name: ocp.args.StandardSave(leaves) for name, leaves in flat.items() if leaves
         }
-        # Copied as text here: orbax writes it later, when the caller may have changed it.
         args["meta"] = ocp.args.JsonSave(json.loads(json.dumps(meta)))
-        with _quiet_orbax():
+        try:
             self._manager.save(step, args=ocp.args.Composite(**args))
+            write_manifest(self.directory / str(step))
+        except ValueError as error:  # what tensorstore makes of an error of the file system
+            if code := re.search(r"os_error_code='(\d+)'", str(error)):
+                number = int(code[1])
+                path = str(self.directory / str(step))
+                raise OSError(number, os.strerror(number), path) from error
+            raise
         return True
 
     def read_meta(self, step: int | None = None) -> dict[str, Any]:
@@ -119,7 +138,7 @@ class CheckpointStore:
         step = self._choose(step)
         meta = self._read(step, {"meta": ocp.args.JsonRestore()})["meta"]
         if not isinstance(meta, dict) or set(meta) != set(META_FIELDS):
-            raise self._unreadable(step, "its meta record has other fields")
+            raise self._damaged(step, "its meta record has other fields")
         return meta
 
     def restore(
@@ -143,31 +162,67 @@ class CheckpointStore:
                 matters, or the arrays differ from `abstract`. Each names what and a cure.
         """
         step = self._choose(step)
+        if reason := find_damage(self.directory / str(step)):
+            raise self._damaged(step, reason)
         meta = self.read_meta(step)
         if config is not None:
             check_resumable(meta["config"], config, self.directory.parent)
         if versions is not None:
             _warn_of_versions(self.directory / str(step), meta["versions"], versions)
-        wanted = {name: _flatten(abstract[name]) for name in self.items}
+        wanted = {name: flatten(abstract[name]) for name in self.items}
         self._check_arrays(step, wanted)
         args = {
-            name: ocp.args.StandardRestore({path: _placed(leaf) for path, leaf in leaves.items()})
+            name: ocp.args.StandardRestore({path: placed(leaf) for path, leaf in leaves.items()})
             for name, leaves in wanted.items()
             if leaves
         }
         found = self._read(step, args) if args else {}
-        trees = {name: _unflatten(abstract[name], found.get(name) or {}) for name in self.items}
+        trees = {name: unflatten(abstract[name], found.get(name) or {}) for name in self.items}
         return trees, meta
 
-    def wait(self) -> None:
-        """Block until the last save is on disk; a failed save raises here."""
-        with _quiet_orbax():
-            self._manager.wait_until_finished()
+    def resume(
+        self, abstract: Mapping[str, Any], config: Config, versions: Mapping[str, str | None]
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """`restore` of the newest step that is sound, for a writer to go on from.
+
+        Steps after it are damaged: each is renamed to `damaged-<step>`, with one line of warning,
+        because the run will save that iteration again.
+
+        Raises:
+            ConfigError: as `restore`; about the newest step if all are damaged.
+        """
+        bad: list[tuple[int, DamagedCheckpoint]] = []
+        for step in reversed(self.steps()):
+            try:
+                found = self.restore(abstract, config, step, versions)
+            except DamagedCheckpoint as error:
+                bad.append((step, error))
+                continue
+            for damaged_step, error in bad:
+                kept = self._set_aside(damaged_step)
+                print(
+                    f"warning: {error.cause}; kept as {kept}, going on from {step}", file=sys.stderr
+                )
+            return found
+        raise bad[0][1] if bad else _nothing_saved(self.directory)
+
+    def _set_aside(self, step: int) -> str:
+        """Renames a step, so that it is none any more; returns its new name."""
+        name, copy = f"damaged-{step}", 1
+        while (self.directory / name).exists():
+            name, copy = f"damaged-{step}-{copy}", copy + 1
+        (self.directory / str(step)).rename(self.directory / name)
+        self._manager.reload()
+        return name
+
+    def drop_after(self, step: int) -> None:
+        """Deletes all later steps: the run goes on from `step` and will save them again."""
+        for later in self.steps():
+            if later > step:
+                self._manager.delete(later)
 
     def close(self) -> None:
-        """Wait and release."""
-        with _quiet_orbax():
-            self._manager.close()
+        self._manager.close()
 
     def __enter__(self) -> CheckpointStore:
         return self
@@ -188,17 +243,16 @@ class CheckpointStore:
 
     def _read(self, step: int, args: Mapping[str, Any]) -> Any:
         try:
-            with _quiet_orbax():
-                return self._manager.restore(step, args=ocp.args.Composite(**args))
+            return self._manager.restore(step, args=ocp.args.Composite(**args))
         except Exception as error:  # orbax, tensorstore and json each have their own classes
-            raise self._unreadable(step, f"{type(error).__name__}: {error}") from error
+            raise self._damaged(step, f"{type(error).__name__}: {error}") from error
 
-    def _unreadable(self, step: int, reason: str) -> ConfigError:
+    def _damaged(self, step: int, reason: str) -> DamagedCheckpoint:
         path = self.directory / str(step)
         older = [other for other in self.steps() if other < step]
-        cure = f"remove {path} to go on from {older[-1]}" if older else "start a new run"
+        cure = f"use an older one: --checkpoint {older[-1]}" if older else "start a new run"
         lines = reason.strip().splitlines() or ["unknown reason"]
-        return ConfigError(f"checkpoint {path} cannot be read: {lines[0][:200]}", cure)
+        return DamagedCheckpoint(f"checkpoint {path} is damaged: {lines[0][:200]}", cure)
 
     def _check_arrays(self, step: int, wanted: Mapping[str, Mapping[str, Any]]) -> None:
         """Names the first array that the program and the checkpoint do not share."""
@@ -207,15 +261,18 @@ class CheckpointStore:
             saved = {}
             if path.exists():
                 try:
-                    with _quiet_orbax(), ocp.StandardCheckpointer() as reader:
-                        saved = reader.metadata(path).item_metadata.tree
+                    with ocp.StandardCheckpointer() as reader:
+                        metadata = reader.metadata(path).item_metadata
                 except Exception as error:
-                    raise self._unreadable(step, f"{type(error).__name__}: {error}") from error
+                    raise self._damaged(step, f"{type(error).__name__}: {error}") from error
+                if metadata is None:
+                    raise self._damaged(step, f"{item} does not say what it holds")
+                saved = metadata.tree
             elif leaves:
-                raise self._unreadable(step, f"{item} is missing")
+                raise self._damaged(step, f"{item} is missing")
             for name in sorted(leaves.keys() | saved.keys()):
-                old = _describe(saved[name]) if name in saved else "absent"
-                new = _describe(leaves[name]) if name in leaves else "absent"
+                old = describe(saved[name]) if name in saved else "absent"
+                new = describe(leaves[name]) if name in leaves else "absent"
                 if old != new:
                     raise ConfigError(
                         f"checkpoint {path} does not fit: {name} is {old} there, {new} here",
@@ -233,41 +290,27 @@ def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
     return CheckpointStore(run / "policy", POLICY_ITEMS, None, read_only)
 
 
+def split_run(run: Any) -> dict[str, Any]:
+    """The items of `full_store` that hold a `collect.RunState`, or the shapes of one."""
+    learner = {"state": run.learner, "key": run.key, "iteration": run.iteration}
+    return {"learner": learner, "replay": run.replay, "context": run.context}
+
+
+def join_run(run: Any, items: Mapping[str, Any]) -> Any:
+    """The inverse of `split_run`, with the type of `run`."""
+    learner = items["learner"]
+    return run.replace(
+        learner=learner["state"],
+        key=learner["key"],
+        iteration=learner["iteration"],
+        replay=items["replay"],
+        context=items["context"],
+    )
+
+
 def _nothing_saved(directory: Path) -> ConfigError:
     cure = "name a run that has saved one with --run DIR, or train without --resume"
     return ConfigError(f"no checkpoint in {directory}", cure)
-
-
-def _flatten(tree: Any) -> dict[str, Any]:
-    """{path: leaf}; arrays without elements are left out, because orbax refuses them."""
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
-        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
-        if leaf.size
-    }
-
-
-def _unflatten(abstract: Any, leaves: Mapping[str, Any]) -> Any:
-    """The tree of `abstract` with the arrays that `_flatten` named."""
-
-    def fill(path: Any, leaf: Any) -> Any:
-        name = jax.tree_util.keystr(path, simple=True, separator="/")
-        return leaves[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
-
-    return jax.tree_util.tree_map_with_path(fill, abstract)
-
-
-def _placed(leaf: Any) -> jax.ShapeDtypeStruct:
-    """The leaf with a sharding of this process: the stored one may name devices it lacks."""
-    sharding = leaf.sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-
-
-def _describe(leaf: Any) -> str:
-    """`float32[3, 4]`; typed keys as the numbers that are stored for them."""
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        leaf = jax.eval_shape(jax.random.key_data, leaf)
-    return f"{leaf.dtype}{list(leaf.shape)}"
 
 
 def _warn_of_versions(path: Path, saved: Mapping[str, Any], here: Mapping[str, Any]) -> None:
@@ -277,13 +320,23 @@ def _warn_of_versions(path: Path, saved: Mapping[str, Any], here: Mapping[str, A
         print(f"warning: {path} was written with {shown}", file=sys.stderr)
 
 
-@contextlib.contextmanager
-def _quiet_orbax() -> Iterator[None]:
-    """Orbax logs routine steps as warnings; the level is put back for everyone else."""
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+def _hush_orbax() -> None:
+    """Drops orbax's own log lines (routine steps as warnings) and its stray complaints.
+
+    Failures are raised besides being logged. When one array fails, orbax closes its event loop
+    under the others, and each of them complains of that from a thread, where nobody can catch it.
+    """
+    logging.getLogger("absl").addFilter(_is_not_from_orbax)  # the same one is added once
+    report = sys.unraisablehook
+    if getattr(report, "__name__", "") == "drop_stragglers":
+        return
+
+    def drop_stragglers(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            report(unraisable)
+
+    sys.unraisablehook = drop_stragglers
+
+
+def _is_not_from_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in Path(record.pathname).parts

@@ -28,7 +28,14 @@ from cmrl_jax.config_io import (
 )
 from cmrl_jax.flags import Parser, names, parse, shown, writable
 from cmrl_jax.goal_files import find_table
-from cmrl_jax.run_dir import config_stem, find_run, new_run, resumed_run
+from cmrl_jax.run_dir import (
+    config_stem,
+    find_run,
+    new_run,
+    resumed_run,
+    write_text,
+    writing_to,
+)
 from cmrl_jax.stop import StopSignal
 
 COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "goals")
@@ -121,15 +128,15 @@ def _train(words: list[str]) -> int:
             check_resumable(read_yaml(run / "config.yaml")[0], config, run)
     else:
         run = new_run(config_stem(path), run)
-        (run / "config.yaml").write_text(to_yaml(config), encoding="utf-8")  # now it can be resumed
-    stop = StopSignal()  # before the imports that take seconds
+    with writing_to(run):
+        write_text(run / "config.yaml", to_yaml(config))  # from here on it can be resumed
+        stop = StopSignal()  # before the imports that take seconds
+        try:
+            from cmrl_jax import trainer
 
-    try:
-        from cmrl_jax import trainer
-
-        return trainer.train(config=config, run_dir=run, stop=stop, resume=resume)
-    finally:
-        stop.restore()
+            return trainer.train(config=config, run_dir=run, stop=stop, resume=resume)
+        finally:
+            stop.restore()
 
 
 def _check_extras(config: Config) -> None:

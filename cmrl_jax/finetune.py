@@ -235,9 +235,12 @@ class FineTuning:
         if self.learner.inference is not None:
             own = own_belief(self.learner, state, self.run.context, jnp.asarray(self.text))
             belief = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, goals, *x.shape[1:])), own)
-        lead = jax.tree.map(lambda x: x[None], (state.actor_params, state.encoder_params))
-        stats = jax.tree.map(lambda x: x[None], state.obs_stats)
-        params = PolicyParams(*lead, stats)
+        first = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one policy
+        params = PolicyParams(
+            actor_params=first(state.actor_params),
+            encoder_params=first(state.encoder_params),
+            obs_stats=first(state.obs_stats),
+        )
         _, scores = self.episode(
             params,
             belief,

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from cmrl_jax.checkpoint import full_store, split_run
+from cmrl_jax.checkpoint import full_store, join_run, split_run
 from cmrl_jax.collect import init_run
 from cmrl_jax.config import Config
 from cmrl_jax.config_io import read_yaml, resolve
@@ -67,7 +67,7 @@ def load_learner(run: Path, config: Config, session: Session) -> tuple[TrainStat
     abstract = jax.eval_shape(init, jax.random.key(0))
     with full_store(run, read_only=True) as store:
         trees, meta = store.restore(split_run(abstract), config, versions=package_versions())
-    return trees["learner"]["state"], meta
+    return join_run(abstract, trees).learner, meta
 
 
 def as_json(curves: Curves) -> dict[str, Any]:

@@ -22,6 +22,7 @@ import jax
 import numpy as np
 
 from cmrl_jax.config import ConfigError
+from cmrl_jax.run_dir import write_text
 
 LEADING_COLUMNS = ("iteration", "env_steps", "gradient_steps", "wall_s", "seed")
 PACKAGES = (
@@ -292,5 +293,5 @@ def write_versions(path: Path) -> dict[str, Any]:
         "cpu_count": os.cpu_count(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    path.write_text(json.dumps(versions, indent=2) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(versions, indent=2) + "\n")
     return versions

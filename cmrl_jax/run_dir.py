@@ -1,18 +1,28 @@
 """Which directory a run writes to: a new `runs/<config>-<time>`, or the one that is resumed.
 
-A directory holds a run from the moment one of `RUN_FILES` lies in it.
+A directory holds a run from the moment one of `RUN_FILES` lies in it. One process at a time writes
+to it: it holds a lock that the system releases when the process ends, however it ends.
 """
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import errno
+import fcntl
+import os
 import re
+import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 from cmrl_jax.config import ConfigError
 
 RUN_FILES = ("config.yaml", "metrics.csv", "ckpt")
 ROOT = Path("runs")
+LOCK = ".lock"
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO)
 _TIME = r"\d{8}-\d{6}(-\d+)?"
 
 
@@ -91,10 +101,55 @@ def new_run(stem: str, run: Path | None, now: datetime.datetime | None = None) -
         raise ConfigError(cause, "add --resume to go on with it, or give another --run DIR")
     try:
         run.mkdir(parents=True, exist_ok=True)
-        probe = run / ".writable"
-        probe.touch()
-        probe.unlink()
     except OSError as error:
-        cause = f"cannot write to run directory {run}: {error.strerror}"
-        raise ConfigError(cause, "give a directory you may write to: --run DIR") from error
+        raise cannot_write(run, error) from error
     return run
+
+
+def cannot_write(run: Path, error: OSError) -> ConfigError:
+    """What to tell a user whose run directory refuses a write."""
+    cause = f"cannot write to run directory {run}: {error.strerror}"
+    if error.errno in DISK_FULL:
+        resume = f"python train.py --run {run} --resume"
+        return ConfigError(cause, f"make room, then go on from the last checkpoint: {resume}")
+    return ConfigError(cause, "give a directory you may write to: --run DIR")
+
+
+@contextlib.contextmanager
+def writing_to(run: Path) -> Iterator[None]:
+    """Keeps every other process from writing to `run`, and reports what its disk refuses.
+
+    Raises:
+        ConfigError: another process writes to it, or a write failed.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(open(run / LOCK, "a+", encoding="utf-8"))
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}")
+            file.flush()
+        except BlockingIOError as error:
+            file.seek(0)
+            cause = f"{file.read() or 'another process'} is writing to run directory {run}"
+            raise ConfigError(cause, "stop it first, or give another --run DIR") from error
+        except OSError as error:
+            raise cannot_write(run, error) from error
+        try:
+            yield
+        except OSError as error:
+            if error.errno in (*DISK_FULL, *REFUSED) and _is_inside(error.filename, run):
+                raise cannot_write(run, error) from error
+            raise
+
+
+def _is_inside(name: str | bytes | None, run: Path) -> bool:
+    """Whether an error is about a file of `run`; one without a name came from a write to it."""
+    return name is None or Path(os.fsdecode(name)).resolve().is_relative_to(run.resolve())
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replaces a file as a whole: a kill leaves the old one or the new one, never a part."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)

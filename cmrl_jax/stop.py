@@ -8,25 +8,43 @@ from __future__ import annotations
 
 import os
 import signal
-from types import FrameType
+import threading
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopSignal:
-    """Installed handlers; `requested` is set by the first signal."""
+    """Installed handlers; `requested` is set by the first signal.
+
+    Python runs a handler only when its main thread comes back from a call, and a compile or an
+    iteration is one call of up to a minute. So the signal's number goes down a pipe, which Python
+    does at once, and a thread of our own reads it.
+    """
 
     def __init__(self) -> None:
         self.requested = False
-        self._old = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._write, False)
+        self._old = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
+        self._old_pipe = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        self._thread = threading.Thread(target=self._watch, name="stop-signal", daemon=True)
+        self._thread.start()
 
     def restore(self) -> None:
         """Puts the handlers back that were there before."""
         for number, handler in self._old.items():
             signal.signal(number, handler)
+        signal.set_wakeup_fd(self._old_pipe)
+        os.close(self._write)
+        self._thread.join()
+        os.close(self._read)
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
-        self.requested = True
-        # A handler may interrupt a print: write past Python's buffered streams.
-        os.write(2, b"stopping at the end of this iteration; once more stops at once\n")
+    def _watch(self) -> None:
+        while number := os.read(self._read, 1):
+            if number[0] not in SIGNALS:
+                continue
+            if self.requested:
+                os._exit(128 + number[0])  # what a shell reports of a process that a signal ended
+            self.requested = True
+            # Past Python's buffered streams, which the main thread may be in the middle of.
+            os.write(2, b"stopping at the end of this iteration; once more stops at once\n")

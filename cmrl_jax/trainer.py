@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from cmrl_jax.checkpoint import full_store, policy_store
+from cmrl_jax.checkpoint import full_store, join_run, policy_store, split_run
 from cmrl_jax.collect import (
     RunState,
     init_run,
@@ -25,8 +25,7 @@ from cmrl_jax.collect import (
     metric_names,
     metric_row,
 )
-from cmrl_jax.config import Config, ConfigError
-from cmrl_jax.config_io import to_yaml
+from cmrl_jax.config import Config, ConfigError, lanes_per_task
 from cmrl_jax.goals import check_same_table
 from cmrl_jax.metrics import (
     LEADING_COLUMNS,
@@ -39,6 +38,7 @@ from cmrl_jax.metrics import (
     package_versions,
     write_versions,
 )
+from cmrl_jax.run_dir import write_text
 from cmrl_jax.scores import format_scores, of_policy, summarise
 from cmrl_jax.session import Session, policy_params, prepare_jax
 from cmrl_jax.stop import StopSignal
@@ -145,28 +145,20 @@ class _Run:
         csv_path = self.run_dir / "metrics.csv"
         config = self.config
         if resume and self.full.steps():
-            trees, meta = self.full.restore(
-                self.trees(abstract), config=config, versions=package_versions()
-            )
+            trees, meta = self.full.resume(split_run(abstract), config, package_versions())
             check_same_table(self.session.goals, meta["goals_sha256"], self.run_dir)
-            learner = trees["learner"]
-            self.state = RunState(
-                learner=learner["state"],
-                replay=trees["replay"],
-                context=trees["context"],
-                key=learner["key"],
-                iteration=learner["iteration"],
-            )
+            self.policy.drop_after(meta["iteration"])
+            self.state = join_run(abstract, trees)
             self.done, self.wall = meta["iteration"], meta["wall_s"]
             self.csv = MetricsCsv(csv_path, columns, offset=meta["csv_offset"])
             self.say(f"resuming {self.run_dir} after iteration {self.done}")
         else:
             if resume:
+                self.check_unsaved(csv_path)
                 self.say(f"{self.run_dir} was stopped before its first save: starting it anew")
             self.state = self.init(jax.random.key(config.seed))
             self.done, self.wall = 0, 0.0
             self.csv = MetricsCsv(csv_path, columns)
-        (self.run_dir / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
         write_versions(self.run_dir / "versions.json")
         self.tensorboard = None
         if config.log.tensorboard:
@@ -175,6 +167,15 @@ class _Run:
         self.evaluator = self.session.evaluator()
         self.clock = time.monotonic() - self.wall
         self.save()
+
+    def check_unsaved(self, csv_path: Path) -> None:
+        """A run saves before its first row: rows without a checkpoint mean that it was lost."""
+        rows = csv_path.read_bytes().count(b"\n") - 1 if csv_path.is_file() else 0
+        if rows > 0 or self.policy.steps():
+            raise ConfigError(
+                f"{self.run_dir} has {rows} rows in metrics.csv but no checkpoint in ckpt/",
+                "put ckpt/ back from a copy, or start a new run in another --run DIR",
+            )
 
     def timed(self, what: str, compile: Callable[[], Any]) -> Any:
         """Announces a compile and says how long it took."""
@@ -221,15 +222,27 @@ class _Run:
             self.save()
 
     def check_health(self, row: dict[str, Any]) -> None:
-        """Stops a run whose every gradient step was skipped: it cannot recover by itself."""
-        if row.get("train/skipped") == 1.0:
+        """Warns of what was skipped or put back; stops a run that cannot recover by itself."""
+        config, iteration = self.config, row["iteration"]
+        kept = f"{self.full.directory} keeps iteration {self.full.steps()[-1]}"
+        skipped, faults = row.get("train/skipped") or 0.0, int(row["train/physics_faults"])
+        if skipped == 1.0:
             raise ConfigError(
-                f"iteration {row['iteration']}: every gradient was non-finite",
-                f"lower sac.lr, then go on from the last good checkpoint: {self.resume_command()}",
+                f"iteration {iteration}: every gradient was non-finite",
+                f"start a new run with a lower sac.lr; {kept}",
             )
-        if row["train/physics_faults"]:
-            count = int(row["train/physics_faults"])
-            self.say(f"warning: {count} lane(s) left the range of float32 and were put back")
+        # As many as a whole task collects: what is learned from is no longer the task.
+        if faults >= lanes_per_task(config) * config.env.horizon:
+            other = "native" if config.env.physics == "mjx" else "mjx"
+            raise ConfigError(
+                f"iteration {iteration}: the physics of {faults} of "
+                f"{self.schedule.steps_per_iteration} control steps was non-finite",
+                f"start a new run with env.physics: {other}, or without the last change; {kept}",
+            )
+        if skipped:
+            self.say(f"warning: {skipped:.1%} of the gradients were non-finite and were skipped")
+        if faults:
+            self.say(f"warning: {faults} lane(s) left the range of float32 and were put back")
 
     def evaluate(self) -> dict[str, Any]:
         """Columns of a periodic evaluation: few goals, few k, all tasks."""
@@ -263,10 +276,6 @@ class _Run:
         share = self.share_done()
         return self.wall * max(1 / share - 1, 0.0) if share else math.inf
 
-    def trees(self, state: RunState) -> dict[str, Any]:
-        learner = {"state": state.learner, "key": state.key, "iteration": state.iteration}
-        return {"learner": learner, "replay": state.replay, "context": state.context}
-
     def save(self) -> None:
         """A full checkpoint of this border, and a policy checkpoint where one is due."""
         self.saved_at = self.wall
@@ -279,17 +288,15 @@ class _Run:
             "versions": package_versions(),
             "goals_sha256": self.session.goals.sha256,
         }
-        self.full.save(self.trees(self.state), meta)
+        self.full.save(split_run(self.state), meta)
         is_last = self.stop.requested or not self.iterations_left()
+        # After the full one: a kill in between leaves a policy to write again, not one too many.
         if self.done and (is_last or self.done % self.config.checkpoint.policy_every == 0):
             policy = {
                 "params": policy_params(self.state.learner),
                 "goal_vectors": self.session.goals.vectors[:, 0],
             }
             self.policy.save({"policy": policy}, meta)
-            self.policy.wait()
-        # The next iteration donates these very buffers, and on the CPU a host copy is a view.
-        self.full.wait()
 
     def finish(self) -> int:
         """The final evaluation: more goals, every k, written beside the CSV."""
@@ -303,7 +310,7 @@ class _Run:
             "iteration": self.done,
             "seed": evaluation.seed,
         }
-        (self.run_dir / "eval.json").write_text(json.dumps(result, indent=2) + "\n")
+        write_text(self.run_dir / "eval.json", json.dumps(result, indent=2) + "\n")
         self.say(format_scores(summary))
         self.say(f"done in {format_duration(self.wall)}: {self.run_dir}")
         return 0

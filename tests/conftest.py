@@ -32,7 +32,7 @@ def refused(capsys):
     return run
 
 
-# For the environment's tests; imported when asked for, since metaworld and mjx take seconds.
+# Imported when asked for, since metaworld and mjx take seconds.
 
 
 @pytest.fixture(scope="session")
@@ -67,3 +67,13 @@ def gl():
         except ValueError as error:
             pytest.skip(str(error).partition("\n")[0])
         return os.environ["MUJOCO_GL"]
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """A finished native run of smoke.yaml, for whole runs to be compared with; do not change it."""
+    from run_helpers import native, smoke
+
+    run = tmp_path_factory.mktemp("undisturbed") / "run"
+    assert smoke(run, *native()) == 0
+    return run

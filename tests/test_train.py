@@ -4,21 +4,17 @@ One run of `smoke.yaml` (module fixture) is compared with its repetition, its re
 stopped by a signal; the presets run two iterations each.
 """
 
-import csv
 import dataclasses
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_helpers import ROOT, assert_same_result, rows_of, run_and_signal, smoke
 
 from cmrl_jax import goal_files
 from cmrl_jax.checkpoint import full_store
@@ -27,38 +23,6 @@ from cmrl_jax.collect import init_run, make_train_iteration
 from cmrl_jax.config import lane_groups
 from cmrl_jax.config_io import load_config
 from cmrl_jax.session import Session, load_policy
-
-ROOT = Path(__file__).resolve().parent.parent
-ITERATIONS = 3
-
-
-def smoke(run, *words):
-    return main(["--config", "smoke.yaml", "--run", str(run), *words])
-
-
-def rows_of(run):
-    """Rows of metrics.csv as text, without the columns that depend on the clock."""
-    with open(run / "metrics.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    is_clock = lambda column: column == "wall_s" or column.startswith("time/")
-    return [{c: text for c, text in row.items() if not is_clock(c)} for row in rows]
-
-
-def checkpoint_leaves(run):
-    """{path: array} of the newest full checkpoint."""
-    config = load_config(str(run / "config.yaml"))
-    learner = Session(config).learner
-    state = jax.eval_shape(lambda key: init_run(config, learner, key), jax.random.key(0))
-    abstract = {
-        "learner": {"state": state.learner, "key": state.key, "iteration": state.iteration},
-        "replay": state.replay,
-        "context": state.context,
-    }
-    with full_store(run, read_only=True) as store:
-        trees, meta = store.restore(abstract)
-    leaves = jax.tree_util.tree_leaves_with_path(trees)
-    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
-    return {jax.tree_util.keystr(p): np.asarray(plain(x)) for p, x in leaves}, meta
 
 
 @pytest.fixture(scope="module")
@@ -124,13 +88,7 @@ def test_resume_equals_an_undisturbed_run_bit_for_bit(finished, tmp_path):
     assert smoke(run, "--train.env_steps", "600") == 0
     assert len(rows_of(run)) == 1
     assert smoke(run, "--resume") == 0
-    assert rows_of(run) == rows_of(finished[0])
-    resumed, meta = checkpoint_leaves(run)
-    straight, straight_meta = checkpoint_leaves(finished[0])
-    assert resumed.keys() == straight.keys() and len(resumed) > 30
-    for path, leaf in straight.items():
-        np.testing.assert_array_equal(resumed[path], leaf, err_msg=path)
-    assert meta["iteration"] == straight_meta["iteration"] == ITERATIONS
+    assert_same_result(run, finished[0])
 
 
 def test_a_run_killed_before_its_first_save_resumes_from_the_start(finished, tmp_path):
@@ -155,26 +113,6 @@ def test_resume_refuses_another_goal_table(finished, tmp_path, monkeypatch, caps
     assert main(["--run", str(finished[0]), "--resume", "--train.env_steps", "9000"]) == 2
     assert "was trained with another goal table" in capsys.readouterr().err
     assert rows_of(finished[0]) == before
-
-
-def run_and_signal(run, marker, *words, **environment):
-    """A training process that gets SIGTERM when it prints `marker` -> exit code, its lines."""
-    command = [sys.executable, str(ROOT / "train.py"), "--config", "smoke.yaml", "--run", str(run)]
-    with subprocess.Popen(
-        [*command, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=run.parent,
-        env=os.environ | environment,
-    ) as process:
-        assert process.stdout is not None
-        lines = []
-        for line in process.stdout:
-            lines.append(line)
-            if line.startswith(marker):
-                process.send_signal(signal.SIGTERM)
-        return process.wait(), lines
 
 
 def test_sigterm_saves_and_leaves_with_code_0_and_the_resume_command(finished, tmp_path):

@@ -1,0 +1,51 @@
+"""The list of a directory's files with their SHA-256, so that damage is found before it is read.
+
+Only the standard library, and a format that `sha256sum -c sha256.txt` understands.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+NAME = "sha256.txt"
+
+
+def write_manifest(directory: Path) -> None:
+    """Lists all files below `directory`; the list appears as a whole or not at all."""
+    lines = [f"{_digest(path)}  {path.relative_to(directory)}\n" for path in _files(directory)]
+    part = directory / f".{NAME}.part"
+    part.write_text("".join(lines), encoding="utf-8")
+    part.replace(directory / NAME)
+
+
+def find_damage(directory: Path) -> str | None:
+    """What is wrong with the first file that is not as listed; None if all are, or without a list.
+
+    A directory without a list is one whose writer was killed just before it could write it.
+    """
+    try:
+        lines = (directory / NAME).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError):
+        return f"{NAME} cannot be read"
+    listed = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+    there = {str(path.relative_to(directory)): path for path in _files(directory)}
+    for name, digest in listed.items():
+        if name not in there:
+            return f"{name} is missing"
+        if _digest(there[name]) != digest:
+            return f"{name} is not what was written"
+    unlisted = there.keys() - listed.keys()
+    return f"{min(unlisted)} is not in {NAME}" if unlisted else None
+
+
+def _files(directory: Path) -> list[Path]:
+    own = (directory / NAME, directory / f".{NAME}.part")
+    return sorted(p for p in directory.rglob("*") if p.is_file() and p not in own)
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,27 @@
+"""A resumed run is the undisturbed run, bit for bit, in a new process."""
+
+import json
+import subprocess
+import sys
+
+from run_helpers import ITERATIONS, ROOT, assert_same_result, native, rows_of, smoke_words
+
+HALF = ITERATIONS // 2
+
+
+def train_in_new_process(run, *words):
+    command = [sys.executable, str(ROOT / "train.py"), *smoke_words(run, *words)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=run.parent)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_resume_in_a_new_process_equals_an_undisturbed_run(undisturbed, tmp_path):
+    run = tmp_path / "run"
+    train_in_new_process(run, *native(HALF))
+    assert len(rows_of(run)) == HALF
+    out = train_in_new_process(run, *native(), "--resume")
+    assert f"resuming {run} after iteration {HALF}" in out
+    assert_same_result(run, undisturbed)
+    scores = [json.loads((r / "eval.json").read_text()) for r in (run, undisturbed)]
+    assert scores[0] == scores[1]
