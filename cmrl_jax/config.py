@@ -170,7 +170,7 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    env_steps: int = doc(2_500_000, "control steps of all lanes together; 0: no limit")
+    env_steps: int = doc(1_000_000, "control steps of all lanes together; 0: no limit")
     minutes: float = doc(0.0, "wall-time limit of the whole run, final evaluation apart; 0: none")
     capacity: int = doc(
         102_400, "replay transitions per task; a multiple of the lanes of a task", above=0

@@ -164,7 +164,7 @@ def start_state(
     """
     fresh = learner.init(jax.random.key(config.seed))
     if adapt == "scratch":
-        return fresh
+        return jax.tree.map(jnp.copy, fresh)  # every leaf a buffer of its own, to be donated
     kept = {name: getattr(trained, name) for name in _NETWORKS}
     if adapt == "z":
         # It begins where the sentence alone puts it, or at the prior's mean.
