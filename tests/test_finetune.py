@@ -1,0 +1,162 @@
+"""Fine-tuning: what gradient steps may change, where it starts, and one short run of it."""
+
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
+
+from cmrl_jax import finetune
+from cmrl_jax.cli import main
+from cmrl_jax.context import init_belief
+from cmrl_jax.finetune import free_latent, own_belief, restrict, start_state
+from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
+from cmrl_jax.learner import make_learner
+
+NETWORKS = ("actor_params", "critic_params", "target_critic_params", "encoder_params")
+
+
+def changed(before, after):
+    """Paths of the leaves of every network that differ."""
+    found = set()
+    for name in NETWORKS:
+        old = jax.tree_util.tree_leaves_with_path(getattr(before, name))
+        new = jax.tree.leaves(getattr(after, name))
+        for (path, a), b in zip(old, new, strict=True):
+            if not np.array_equal(a, b):
+                found.add(f"{name}/{jax.tree_util.keystr(path, simple=True, separator='/')}")
+    return found
+
+
+@pytest.fixture(scope="module")
+def made():
+    return build(tiny_config())
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return filled_ring()
+
+
+@pytest.mark.parametrize("adapt", ["posterior", "router", "all"])
+def test_gradient_steps_change_what_is_adapted_and_nothing_else(made, ring, adapt):
+    update = jax.jit(restrict(made.learner, adapt).update)
+    state = made.state
+    for step in range(3):  # heads start small: a few steps until every leaf has a gradient
+        state, _ = update(state, ring, ring, jax.random.key(step))
+    moved = changed(made.state, state)
+    is_router = lambda path: any(part in path for part in ("embedding", "gating", "routing"))
+    if adapt == "posterior":
+        assert not moved
+    elif adapt == "router":
+        assert moved and all(map(is_router, moved))
+        assert {path.split("/")[0] for path in moved} == set(NETWORKS[:3])
+    else:
+        assert {path.split("/")[0] for path in moved} == set(NETWORKS)
+        assert not all(map(is_router, moved))
+
+
+def test_a_free_latent_is_one_point_and_learns(ring):
+    """Whatever was seen z is the parameter; the critics' loss moves it, and it alone."""
+    config = tiny_config(encoder={"information_bottleneck": False})
+    latent = free_latent(config.encoder.latent_dim)
+    learner = make_learner(config, GOALS, 3, 2, inference=latent)
+    state = jax.jit(learner.init)(jax.random.key(0))
+    z = jnp.array([0.3, -0.2])
+    params = {"z": z}
+    state = replace(state, encoder_params=params, encoder_opt_state=finetune.init_adam(params))
+    belief = init_belief((4,), 2)
+    np.testing.assert_array_equal(
+        latent.posterior_of_belief(params, belief).mean, np.tile(z, (4, 1))
+    )
+    drawn = latent.sample_z(jax.random.key(1), latent.posterior_of_belief(params, belief))
+    np.testing.assert_array_equal(drawn, np.tile(z, (4, 1)))
+    update = jax.jit(restrict(learner, "z").update)
+    after = state
+    for step in range(3):
+        after, _ = update(after, ring, ring, jax.random.key(step))
+    assert changed(state, after) == {"encoder_params/z"}
+
+
+def test_own_belief_is_the_posterior_of_every_stored_transition(made):
+    """All slots that are filled, each once, against the encoder on the transitions themselves."""
+    ring = filled_ring()
+    single = ring.replace(rows=ring.rows[:1], size=jnp.asarray(10, jnp.int32))
+    inference = made.learner.inference
+    belief = own_belief(made.learner, made.state, single, GOALS[0, 0])
+    assert belief.sums.count.tolist() == [10]
+    rows = np.asarray(single.rows[0, :10])
+    lead = lambda a, b: jnp.asarray(rows[None, :, a:b])
+    context = type("Transitions", (), {})()
+    context.obs, context.action, context.reward = lead(0, 3), lead(3, 5), lead(5, 6)[..., 0]
+    context.next_obs = lead(9, 12)
+    expected = inference.posterior(
+        made.state.encoder_params, context, jnp.ones((1, 10)), GOALS[:1, 0], jnp.ones(1)
+    )
+    got = inference.posterior_of_belief(
+        made.state.encoder_params, belief, GOALS[:1, 0], jnp.ones(1)
+    )
+    np.testing.assert_allclose(got.mean, expected.mean, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(got.variance, expected.variance, rtol=1e-4)
+
+
+def test_a_new_task_starts_from_the_trained_parts(made):
+    config = tiny_config()
+    config = replace(
+        config,
+        tasks=replace(config.tasks, train=("window-close",), test=()),
+        collect=replace(config.collect, lanes=1),
+    )
+    learner = make_learner(config, GOALS[:1], 3, 2)
+    trained = replace(
+        made.state,
+        actor_params=spread(made.state.actor_params),
+        critic_params=spread(made.state.critic_params),
+        log_alpha=jnp.array([-1.0, -2.0, -6.0]),
+    )
+    state = start_state("all", config, learner, trained, GOALS[0, 0])
+    assert not changed(trained, state)
+    np.testing.assert_allclose(state.log_alpha, [-3.0])  # the mean of the training tasks'
+    fresh = start_state("scratch", config, learner, trained, GOALS[0, 0])
+    begun = {path.split("/")[0] for path in changed(trained, fresh)}
+    assert begun == {"actor_params", "critic_params"}
+    assert trained.log_alpha.shape == (TASKS,)
+
+
+@pytest.mark.parametrize(
+    ("words", "cause", "cure"),
+    [
+        (["--task", "window"], "unknown task 'window'", "window-close"),
+        (["--task", "drawer-open"], "was trained on drawer-open", "window-close"),
+        (["--task", "window-close", "--adapt", "rooter"], "'rooter' is no way", "router"),
+        (["--task", "window-close", "--episodes", "0"], "--episodes is 0", "1 or more"),
+        (["--task", "window-close", "--goals", "51"], "--goals is 51", "50"),
+    ],
+)
+def test_mistakes_are_refused(undisturbed, refused, words, cause, cure):
+    got = refused("finetune", "--run", str(undisturbed), *words)
+    assert cause in got[0] and cure in got[1]
+
+
+def test_a_network_without_router_has_none_to_adapt():
+    config = tiny_config(**VARIANTS["pearl"])
+    options = FinetuneOptions("window-close", adapt=ADAPT)
+    with pytest.raises(ValueError, match="no router"):
+        check_run(config, options)
+
+
+def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
+    """Before any experience every way to adapt scores the trained policy; scratch does not."""
+    out = tmp_path / "curves.json"
+    words = ["--task", "window-close", "--episodes", "2", "--goals", "2", "--json", str(out)]
+    ways = ["--adapt", "posterior,router"]
+    assert main(["finetune", "--run", str(undisturbed), *words, *ways]) == 0
+    result = json.loads(out.read_text())
+    curves = result["curves"]
+    assert set(curves) == {"posterior", "router"} and list(curves["router"]) == ["0", "1", "2"]
+    assert curves["posterior"]["0"] == curves["router"]["0"]
+    assert result["task"] == "window-close" and result["episodes"] == 2
+    assert "router" in capsys.readouterr().out
