@@ -23,6 +23,8 @@ from cmrl_jax.replay import Transition
 from cmrl_jax.rollout import rollout
 from envs.sawyer import Ml4Env
 
+Array = jax.Array | np.ndarray
+
 
 class PolicyParams(NamedTuple):
     """What acting needs: the policy checkpoint's arrays."""
@@ -35,12 +37,12 @@ class PolicyParams(NamedTuple):
 class Episode(NamedTuple):
     """Scores of one episode of every lane."""
 
-    success_any: jax.Array  # at any step, Meta-World's rule
-    success_last: jax.Array
-    returns: jax.Array
-    first_success: jax.Array  # control step, the horizon where there is none
-    final_distance: jax.Array  # metres
-    faults: jax.Array  # times the lane's physics was put back
+    success_any: Array  # at any step, Meta-World's rule
+    success_last: Array
+    returns: Array
+    first_success: Array  # control step, the horizon where there is none
+    final_distance: Array  # metres
+    faults: Array  # times the lane's physics was put back
 
 
 class Lanes(NamedTuple):

@@ -164,16 +164,13 @@ class Evaluator:
         return jax.tree.map(np.array, belief)
 
     def _lanes(self, trial: Trial) -> Lanes:
-        goals, train = trial.placements.shape[1], self._train_tasks
-        shape = (len(trial.tasks), goals, trial.draws)
-        task, goal, draw = (x.ravel() for x in np.indices(shape, np.int32))
-        env_task = np.array([task_id(name) for name in trial.tasks], np.int32)[task]
+        task, goal, _ = _indices(trial)
+        train = self._train_tasks
         rows = [train.index(name) if name in train else 0 for name in trial.tasks]
         return Lanes(
-            env_task=env_task,
+            env_task=_task_ids(trial)[task],
             train_row=np.array(rows, np.int32)[task],
-            lane_id=(draw * np.int32(len(TASKS)) + env_task) * np.int32(GOAL_IDS)
-            + (goal + np.int32(trial.first_goal)),
+            lane_id=lane_names(trial),
             placement=np.asarray(trial.placements, np.float32)[task, goal],
         )
 
@@ -182,6 +179,23 @@ class Evaluator:
         texts = np.repeat(np.asarray(trial.texts, np.float32), trial.draws, axis=2)
         texts = texts.reshape(len(texts), -1, texts.shape[-1])
         return texts[np.minimum(np.arange(self.policies), len(texts) - 1)]
+
+
+def lane_names(trial: Trial) -> np.ndarray:
+    """What a lane's noise depends on: a number for each (task, goal, draw), int32 (lane,)."""
+    task, goal, draw = _indices(trial)
+    name = draw * np.int32(len(TASKS)) + _task_ids(trial)[task]
+    return name * np.int32(GOAL_IDS) + (goal + np.int32(trial.first_goal))
+
+
+def _indices(trial: Trial) -> np.ndarray:
+    """Task, goal and draw of each lane, (3, lane)."""
+    shape = (len(trial.tasks), trial.placements.shape[1], trial.draws)
+    return np.indices(shape, np.int32).reshape(3, -1)
+
+
+def _task_ids(trial: Trial) -> np.ndarray:
+    return np.array([task_id(name) for name in trial.tasks], np.int32)
 
 
 def _stack(policies: Sequence[PolicyParams]) -> PolicyParams:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from cmrl_jax.config import ConfigError
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
 from cmrl_jax.scores import ScoreCsv, cell_rows, format_scores, of_policy, summarise
@@ -30,7 +29,9 @@ def evaluate_run(
         ConfigError: no such checkpoint, or it does not fit this program.
     """
     if options.physics == "metaworld":
-        raise ConfigError("--physics metaworld is not built yet", "use --physics native")
+        from cmrl_jax.evaluate_metaworld import evaluate_in_metaworld
+
+        return evaluate_in_metaworld(run, options, checkpoint, json_path, csv_path)
     config = evaluation_config(run, options.physics)
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)

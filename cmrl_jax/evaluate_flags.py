@@ -44,6 +44,7 @@ class EvalOptions:
         weights: folder of the text encoder's weights, where `text` needs them.
         any_table: take sentences from a goal table that is not the run's.
         lanes: parallel episodes in a batch.
+        adaptation_episodes, evaluation_episodes: of Meta-World's own function.
     """
 
     k: tuple[int, ...] | None = None
@@ -62,6 +63,8 @@ class EvalOptions:
     weights: Path | None = None
     any_table: bool = False
     lanes: int | None = None
+    adaptation_episodes: int = 10
+    evaluation_episodes: int = 3
 
 
 def _parser(command: str, description: str) -> argparse.ArgumentParser:
@@ -123,6 +126,10 @@ def eval_parser() -> argparse.ArgumentParser:
     add("--checkpoint", type=natural, metavar="N", help="iteration of the checkpoint [the last]")
     add("--json", type=Path, metavar="F", help="write the figures to this file")
     add("--csv", type=Path, metavar="F", help="write one row a task, goal, draw and k")
+    own = parser.add_argument_group("Meta-World's own function, with --physics metaworld")
+    for name, default in (("adaptation", 10), ("evaluation", 3)):
+        text = f"its {name} episodes [{default}]"
+        own.add_argument(f"--{name}-episodes", type=natural, metavar="N", help=text)
     return parser
 
 
@@ -180,7 +187,17 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
     if args.physics == "metaworld" and args.z in ("shuffled", "other"):
         cause = f"--z {args.z} with --physics metaworld, where lanes know nothing of each other"
         raise ConfigError(cause, "use --z posterior, prior or text, or --physics native")
+    own = {}
+    for name in ("adaptation_episodes", "evaluation_episodes"):
+        if (value := getattr(args, name, None)) is not None:
+            flag = f"--{name.replace('_', '-')}"
+            if args.physics != "metaworld":
+                raise ConfigError(f"{flag} without --physics metaworld", "leave it out")
+            own[name] = value
+    if own.get("evaluation_episodes") == 0:
+        raise ConfigError("--evaluation-episodes is 0", "give at least one episode")
     return EvalOptions(
+        **own,
         k=args.k,
         tasks=args.tasks,
         goals=args.goals,

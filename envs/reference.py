@@ -1,7 +1,7 @@
 """Meta-World's own environments and scripted policies: the oracle the port is compared with.
 
 Nothing here is our logic: observation, reward and success come out of the `metaworld` package.
-The only file besides `goal_sets.py` (its maker) that imports metaworld's classes.
+With `metaworld_envs.py` and `goal_sets.py` (its maker) all that imports metaworld's classes.
 
 NOTES (Farama-Foundation/Metaworld: metaworld/sawyer_xyz_env.py, read and measured on 3.0.0)
 1. `reset` runs `reset_model` twice with `mj_resetData` in between, so a start depends neither on
@@ -21,7 +21,6 @@ NOTES (Farama-Foundation/Metaworld: metaworld/sawyer_xyz_env.py, read and measur
 from __future__ import annotations
 
 import dataclasses
-import pickle
 import warnings
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -29,9 +28,10 @@ from typing import Any, Literal, Protocol
 import mujoco
 import numpy as np
 from metaworld import policies
-from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
-from metaworld.types import Task
+
+from envs.metaworld_envs import make_task, metaworld_name
 
 _POLICIES = {
     "drawer-open": policies.SawyerDrawerOpenV3Policy,
@@ -165,10 +165,8 @@ class ReferenceEnv:
         _check_task(task)
         self.task = task
         self.goal_observable = goal_observable
-        self._name = f"{task}-v3"
-        self._class: Any = ALL_V3_ENVIRONMENTS[self._name]
         # Any: the attributes a task sets in its reset are not declared on metaworld's base class.
-        self._env: Any = self._class()
+        self._env: Any = ALL_V3_ENVIRONMENTS[metaworld_name(task)]()
         self._fixture = task.split("-")[0]  # the scenes name the body so
         self._prev_frame = np.zeros(18)
 
@@ -271,12 +269,7 @@ class ReferenceEnv:
         return obs.copy(), float(reward), bool(info["success"]), info
 
     def _set_task(self, rand_vec: np.ndarray) -> None:
-        data = dict(ML1_args_kwargs[self._name]["kwargs"])
-        del data["task_id"]
-        data["rand_vec"] = np.array(rand_vec, np.float64)
-        data["env_cls"] = self._class
-        data["partially_observable"] = not self.goal_observable
-        self._env.set_task(Task(env_name=self._name, data=pickle.dumps(data)))
+        self._env.set_task(make_task(self.task, rand_vec, self.goal_observable))
 
     def positions(self) -> Positions:
         """Returns the raw positions of the simulator's current kinematics.

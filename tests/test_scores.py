@@ -36,7 +36,7 @@ def episode(seed, shape=(2, 2, 5, 3)):
     flag = lambda: generator.random(shape) < 0.6
     step = generator.integers(0, 200, shape)
     fields = (flag(), flag(), number(), step, number(), np.zeros(shape, np.int32))
-    return Episode(*fields)  # pyright: ignore[reportArgumentType]
+    return Episode(*fields)
 
 
 def assert_summaries_agree(found, wanted):
@@ -84,7 +84,7 @@ def test_the_interval_is_the_binomials():
 def test_draws_of_a_goal_do_not_count_as_goals():
     """The interval is over goals: repeating every draw must not shrink it."""
     one = {0: episode(0, (2, 5, 1))}
-    many = {0: Episode(*(np.repeat(x, 10, axis=-1) for x in one[0]))}  # pyright: ignore[reportArgumentType]
+    many = {0: Episode(*(np.repeat(x, 10, axis=-1) for x in one[0]))}
     assert_summaries_agree(summarise(one, TASKS), summarise(many, TASKS))
 
 
