@@ -21,7 +21,7 @@ import orbax.checkpoint as ocp
 
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import check_resumable
-from cmrl_jax.manifest import find_damage, write_manifest
+from cmrl_jax.manifest import find_damage, is_listed, write_manifest
 from cmrl_jax.named_arrays import describe, flatten, not_finite, placed, unflatten
 
 FULL_ITEMS = ("learner", "replay", "context")
@@ -62,6 +62,7 @@ class CheckpointStore:
         """
         self.directory = directory.absolute()  # orbax refuses relative paths
         self.items = items
+        self.keep = keep
         if not read_only:
             try:
                 self.directory.mkdir(parents=True, exist_ok=True)
@@ -71,7 +72,6 @@ class CheckpointStore:
                 raise ConfigError(cause, cure) from error
         _hush_orbax()
         options = ocp.CheckpointManagerOptions(
-            preservation_policy=ocp.checkpoint_managers.LatestN(n=keep) if keep else None,
             cleanup_tmp_directories=not read_only,
             read_only=read_only,
             create=False,
@@ -82,6 +82,8 @@ class CheckpointStore:
         self._manager = ocp.CheckpointManager(
             self.directory, item_names=(*items, "meta"), options=options
         )
+        if not read_only:
+            self._prune()  # what a kill left of a step that was being deleted
 
     def steps(self) -> list[int]:
         """Iterations that can be restored, oldest first."""
@@ -121,6 +123,7 @@ class CheckpointStore:
         try:
             self._manager.save(step, args=ocp.args.Composite(**args))
             write_manifest(self.directory / str(step))
+            self._prune()
         except ValueError as error:  # what tensorstore makes of an error of the file system
             if code := re.search(r"os_error_code='(\d+)'", str(error)):
                 number = int(code[1])
@@ -200,9 +203,10 @@ class CheckpointStore:
                 continue
             for damaged_step, error in bad:
                 kept = self._set_aside(damaged_step)
-                print(
-                    f"warning: {error.cause}; kept as {kept}, going on from {step}", file=sys.stderr
-                )
+                tail = f"; kept as {kept}, going on from {step}"
+                print(f"warning: {error.cause}{tail}", file=sys.stderr)
+            if not is_listed(self.directory / str(step)):
+                write_manifest(self.directory / str(step))
             return found
         raise bad[0][1] if bad else _nothing_saved(self.directory)
 
@@ -214,6 +218,10 @@ class CheckpointStore:
         (self.directory / str(step)).rename(self.directory / name)
         self._manager.reload()
         return name
+
+    def _prune(self) -> None:
+        for step in self.steps()[: -self.keep] if self.keep else ():
+            self._manager.delete(step)
 
     def drop_after(self, step: int) -> None:
         """Deletes all later steps: the run goes on from `step` and will save them again."""

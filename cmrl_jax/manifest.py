@@ -19,15 +19,17 @@ def write_manifest(directory: Path) -> None:
     part.replace(directory / NAME)
 
 
-def find_damage(directory: Path) -> str | None:
-    """What is wrong with the first file that is not as listed; None if all are, or without a list.
+def is_listed(directory: Path) -> bool:
+    """Whether there is a list. There is none if the writer was killed just before it."""
+    return (directory / NAME).exists()
 
-    A directory without a list is one whose writer was killed just before it could write it.
-    """
+
+def find_damage(directory: Path) -> str | None:
+    """What is wrong with the first file that is not as listed; None if all are, or without a list."""
+    if not is_listed(directory):
+        return None
     try:
         lines = (directory / NAME).read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return None
     except (OSError, UnicodeDecodeError):
         return f"{NAME} cannot be read"
     listed = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}

@@ -150,6 +150,23 @@ def test_a_reader_of_a_damaged_step_is_told_of_an_older_one(tmp_path):
     assert sorted(p.name for p in (tmp_path / "ckpt").iterdir()) == ["1", "2"], "nothing to go on"
 
 
+def test_a_step_that_was_being_deleted_is_swept(tmp_path):
+    save_steps(tmp_path, 1, 2, 3)
+    (tmp_path / "ckpt" / "1" / "learner" / "_METADATA").unlink()
+    with checkpoint.full_store(tmp_path, keep=2) as store:
+        assert store.steps() == [2, 3]
+    assert sorted(p.name for p in (tmp_path / "ckpt").iterdir()) == ["2", "3"]
+
+
+def test_a_step_without_its_list_is_read_and_then_listed(tmp_path):
+    save_steps(tmp_path, 1)
+    unlist(tmp_path, 1)
+    with checkpoint.full_store(tmp_path) as store:
+        assert store.resume(ABSTRACT, Config(), VERSIONS)[1]["iteration"] == 1
+    flip_a_bit(tmp_path / "ckpt" / "1" / "meta" / "metadata", 0)
+    assert "meta/metadata is not what was written" in cause_and_cure(tmp_path)[0]
+
+
 def test_a_policy_ahead_of_its_run_is_dropped(tmp_path):
     with checkpoint.policy_store(tmp_path) as store:
         for step in (1, 2, 5):
