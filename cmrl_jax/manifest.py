@@ -25,7 +25,7 @@ def is_listed(directory: Path) -> bool:
 
 
 def find_damage(directory: Path) -> str | None:
-    """What is wrong with the first file that is not as listed; None if all are, or without a list."""
+    """What is wrong with the first file not as listed; None if all are, or without a list."""
     if not is_listed(directory):
         return None
     try:

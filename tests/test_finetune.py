@@ -15,6 +15,7 @@ from cmrl_jax.context import init_belief
 from cmrl_jax.finetune import free_latent, own_belief, restrict, start_state
 from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
 from cmrl_jax.learner import make_learner
+from cmrl_jax.replay import ContextBatch
 
 NETWORKS = ("actor_params", "critic_params", "target_critic_params", "encoder_params")
 
@@ -90,9 +91,9 @@ def test_own_belief_is_the_posterior_of_every_stored_transition(made):
     assert belief.sums.count.tolist() == [10]
     rows = np.asarray(single.rows[0, :10])
     lead = lambda a, b: jnp.asarray(rows[None, :, a:b])
-    context = type("Transitions", (), {})()
-    context.obs, context.action, context.reward = lead(0, 3), lead(3, 5), lead(5, 6)[..., 0]
-    context.next_obs = lead(9, 12)
+    context = ContextBatch(
+        obs=lead(0, 3), action=lead(3, 5), reward=lead(5, 6)[..., 0], next_obs=lead(9, 12)
+    )
     expected = inference.posterior(
         made.state.encoder_params, context, jnp.ones((1, 10)), GOALS[:1, 0], jnp.ones(1)
     )
