@@ -85,7 +85,7 @@ def test_a_free_latent_is_one_point_and_learns(ring):
 def test_own_belief_is_the_posterior_of_every_stored_transition(made):
     """All slots that are filled, each once, against the encoder on the transitions themselves."""
     ring = filled_ring()
-    single = ring.replace(rows=ring.rows[:1], size=jnp.asarray(10, jnp.int32))
+    single = replace(ring, rows=ring.rows[:1], size=jnp.asarray(10, jnp.int32))
     inference = made.learner.inference
     belief = own_belief(made.learner, made.state, single, GOALS[0, 0])
     assert belief.sums.count.tolist() == [10]
