@@ -122,12 +122,11 @@ class MetaWorldAgent:
     def step(self, timestep: Timestep) -> None:
         """Remembers the transitions just made; an episode that ended goes into the belief."""
         ended = np.logical_or(timestep.terminated, timestep.truncated)
-        lane = np.flatnonzero(~ended)  # NOTE 2
-        place = lane, self._count[lane]
-        self._memory["obs"][place] = self._shown[lane]
-        self._memory["action"][place] = timestep.action[lane]
-        self._memory["reward"][place] = timestep.reward[lane]
-        self._pending = ~ended
+        place = np.arange(self._lanes), self._count
+        self._memory["obs"][place] = self._shown
+        self._memory["action"][place] = timestep.action
+        self._memory["reward"][place] = timestep.reward
+        self._pending = ~ended  # NOTE 2
         if ended.any():
             self._observe(ended)
             self._begin(ended)

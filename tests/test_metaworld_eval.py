@@ -238,7 +238,6 @@ def test_metaworlds_own_function_drives_the_agent_as_it_should(session, policy, 
     rate, mean_return, per_task = metalearning_evaluation(
         agent, envs, num_evals=2, adaptation_steps=1, adaptation_episodes=2, evaluation_episodes=3
     )
-    envs.close()
     names = [name for name, _, _ in agent.log]
     a_run = ["init"] + 2 * HORIZON * ["adapt_action"] + ["adapt"] + 3 * HORIZON * ["eval_action"]
     assert names == 2 * a_run
@@ -258,6 +257,13 @@ def test_metaworlds_own_function_drives_the_agent_as_it_should(session, policy, 
         assert all(np.array_equal(z, episode[0]) for episode in by_episode for z in episode)
         distinct = np.unique([episode[0][0] for episode in by_episode], axis=0)
         assert len(distinct) == 5  # one draw an episode, in evaluation too
+    # Frozen is frozen, whatever comes after.
+    agent.init()
+    agent.adapt()
+    envs.call("toggle_terminate_on_success", False)
+    adaptation_run(agent, envs, 1, HORIZON)
+    assert agent.count() == 0
+    envs.close()
 
 
 def test_the_first_evaluation_episode_is_the_protocols_k(session, policy, trial):
