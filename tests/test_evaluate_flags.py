@@ -112,16 +112,16 @@ def test_sweep_hands_over_its_flags(calls, refused, here):
         make_run(here / "runs" / name)
     (here / "runs" / "a-3").mkdir()  # holds no run
     patterns = ["--runs", "runs/b", "runs/a-*", "runs/*"]
-    files = ["--json", "f.json", "--csv", "f.csv", "--compare", "8"]
+    files = ["--json", "f.json", "--csv", "f.csv"]
     assert main(["sweep", *patterns, "--checkpoints", "20,40", *PROTOCOL, *files]) == 0
-    assert main(["sweep", "--runs", "runs/b"]) == 0
+    assert main(["sweep", "--runs", "runs/b", "--compare", "8"]) == 0
     assert calls[0] == {
         "runs": [Path("runs/b"), Path("runs/a-1"), Path("runs/a-2")], "checkpoints": (20, 40),
-        "options": OPTIONS, "json_path": Path("f.json"), "csv_path": Path("f.csv"), "compare": 8,
+        "options": OPTIONS, "json_path": Path("f.json"), "csv_path": Path("f.csv"), "compare": 0,
     }  # fmt: skip
     assert calls[1] == {
         "runs": [Path("runs/b")], "checkpoints": "last", "options": EvalOptions(),
-        "json_path": None, "csv_path": None, "compare": 0,
+        "json_path": None, "csv_path": None, "compare": 8,
     }  # fmt: skip
     make_run(here / "runs" / "m", "mtsac.yaml")
     assert "(runs/m)" in refused("sweep", "--runs", "runs/*", "--k", "0,1")[0]
