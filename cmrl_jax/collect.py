@@ -22,7 +22,7 @@ from cmrl_jax.config import Config, lane_groups, lanes_per_task
 from cmrl_jax.diagnostics import make_diagnose
 from cmrl_jax.learner import Learner, TrainState
 from cmrl_jax.replay import ContextState, ReplayState, Transition
-from cmrl_jax.rollout import rollout
+from cmrl_jax.rollout import correlated_noise, rollout
 from envs.sawyer import ACTION_SIZE, OBS_SIZE, Ml4Env, State
 from envs.tasks import task_id
 
@@ -91,6 +91,10 @@ def make_train_iteration(
     train_task = jnp.repeat(jnp.arange(num_tasks), per_task)  # (lane,) row of the rings
     groups = lane_groups(config)
     source = np.tile(np.repeat(np.arange(3), groups), num_tasks)  # (lane,) index of Z_SOURCES
+    # Dealt out so that each group of a task has the whole range of scales.
+    scale = np.geomspace(1.0, collect.noise_scale, per_task)
+    shuffled = np.random.default_rng(0).permutation(per_task)
+    lane_scale = jnp.asarray(np.tile(scale[shuffled], num_tasks), jnp.float32)  # (lane,)
     writers = groups[0] if collect.context_lanes == "prior" else per_task
     inference = learner.inference
     diagnose = make_diagnose(config, learner, goal_vectors)
@@ -153,11 +157,17 @@ def make_train_iteration(
     def train_iteration(run: RunState) -> tuple[RunState, dict[str, jax.Array]]:
         is_first = run.iteration == 0
         random_actions = is_first & (collect.initial == "random")
-        k_z, k_reset, k_chunks, k_diagnose, key = jax.random.split(run.key, 5)
+        k_z, k_reset, k_noise, k_chunks, k_diagnose, key = jax.random.split(run.key, 6)
         zc, actual_source = draw_conditioning(run, k_z)
 
-        def chunk(carry: tuple[RunState, State], key: jax.Array):
+        noise = lane_scale[:, None] * correlated_noise(
+            k_noise, horizon, (lanes, ACTION_SIZE), collect.noise_correlation
+        )
+        noise = noise.reshape(-1, collect.chunk, lanes, ACTION_SIZE)
+
+        def chunk(carry: tuple[RunState, State], inputs: tuple[jax.Array, jax.Array]):
             run, state = carry
+            key, chunk_noise = inputs
             k_act, k_update = jax.random.split(key)
             state, transitions, stats = rollout(
                 env,
@@ -169,6 +179,7 @@ def make_train_iteration(
                 collect.chunk,
                 horizon,
                 random_actions=random_actions,
+                noise=chunk_noise,
             )
             run = store(run, jax.tree.map(by_task, transitions))
             run, metrics = jax.lax.cond(is_first, skip_steps, train_steps, run, k_update)
@@ -177,7 +188,7 @@ def make_train_iteration(
         run = run.replace(key=key)
         keys = jax.random.split(k_chunks, horizon // collect.chunk)
         (run, state), (metrics, reward, stats) = jax.lax.scan(
-            chunk, (run, reset_lanes(k_reset)), keys
+            chunk, (run, reset_lanes(k_reset)), (keys, noise)
         )
         metrics = {name: jnp.mean(value, 0) for name, value in metrics.items()}
         flat = lambda x: by_task(x.reshape(horizon, lanes))  # (time, task, lane)
@@ -200,7 +211,7 @@ def make_train_iteration(
         return run.replace(
             learner=state,
             replay=rings.add(run.replay, transitions),
-            context=rings.add_context(run.context, eligible),
+            context=rings.add(run.context, eligible),
         )
 
     def with_statistics(state: TrainState, transitions: Transition) -> TrainState:

@@ -124,6 +124,7 @@ class SacConfig:
     variant: Literal["twin_q", "v"] = doc("twin_q", "twin Q targets, or PEARL's V network")
     alpha: Literal["fixed", "shared", "per_task"] = doc("per_task", "entropy temperature")
     alpha_init: float = doc(0.01, "first (or fixed) temperature", above=0)
+    target_entropy: float = doc(-0.5, "H_target, nats an action dimension", low=-10, high=1)
     gamma: float = doc(0.99, "discount a control step", above=0, high=1)
     tau: float = doc(0.005, "target update rate a gradient step", above=0, high=1)
     n_step: int = doc(3, "control steps in the Bellman target", low=1)
@@ -147,6 +148,14 @@ class CollectConfig:
     updates_per_vector_step: int = doc(4, "gradient steps per control step of all lanes", above=0)
     group_frac: tuple[float, float, float] = doc(
         (0.25, 0.25, 0.5), "shares of lanes whose z is drawn from prior, text, posterior", high=1
+    )
+    noise_correlation: float = doc(
+        0.9, "correlation of a lane's exploration noise from one step to the next", high=0.999
+    )
+    noise_scale: float = doc(
+        6.0,
+        "exploration noise of a task's lanes: from the policy's own to this many times it",
+        low=1,
     )
     initial: Literal["random", "prior"] = doc("random", "actions of iteration 0")
     context_source: Literal["recent", "all"] = doc("recent", "context from last episodes, or all")

@@ -78,7 +78,8 @@ class Learner:
         task_losses: (TrainState, replay_state, context_state, key) -> a function of the critics'
             parameters: the TD loss of every training task on one minibatch, (T,).
         policy: (actor_params, obs_stats, obs (lane, obs) raw, zc (lane, conditioning), key,
-            deterministic) -> action (lane, act), Routing or None.
+            deterministic, noise=None) -> action (lane, act), Routing or None. `noise` (lane, act),
+            standard normal, takes the place of a draw from `key`.
         normalize_obs: (obs_stats, obs (..., obs)) -> (..., obs); the identity by configuration.
         task_conditioning: task ids (lane,) -> zc (lane, conditioning) where it is no latent.
     """
@@ -140,9 +141,10 @@ def make_learner(
             raise ValueError("model.conditioning is z: draw it with `inference`")
         return jax.nn.one_hot(task_ids, networks.conditioning_size)
 
-    def policy(actor_params, obs_stats, obs, zc, key, deterministic):
+    def policy(actor_params, obs_stats, obs, zc, key, deterministic, noise=None):
         mean, log_std, routing = networks.actor(actor_params, normalize_obs(obs_stats, obs), zc)
-        noise = jax.random.normal(key, mean.shape)
+        if noise is None:
+            noise = jax.random.normal(key, mean.shape)
         action, _ = sample_tanh_gaussian(mean, log_std, noise)
         return jnp.where(deterministic, jnp.tanh(mean), action), routing
 
@@ -205,7 +207,7 @@ def make_learner(
         if cfg.collect.context_source == "all":
             context = replay.sample_transitions(replay_state, k_context, task_ids, n_max)
         else:
-            context = replay.sample_context(context_state, k_context, task_ids, n_max)
+            context = replay.sample_transitions(context_state, k_context, task_ids, n_max)
         u_length, u_empty, u_goal, u_text = jax.random.uniform(k_uniform, (4, rows))
         paraphrase = (u_text * goal_vectors.shape[1]).astype(jnp.int32)
         return data._replace(

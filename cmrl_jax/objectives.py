@@ -201,6 +201,7 @@ def make_objectives(
     def alpha(log_alpha: jax.Array, log_prob: jax.Array, task_ids: jax.Array) -> jax.Array:
         if sac.alpha == "shared":
             log_alpha = jnp.full_like(log_alpha, 1.0) * jnp.mean(log_alpha)
-        return losses.alpha_loss(log_alpha[task_ids], log_prob, -float(action_size))
+        target = sac.target_entropy * action_size
+        return losses.alpha_loss(log_alpha[task_ids], log_prob, target)
 
     return Objectives(infer, critic, actor, alpha)

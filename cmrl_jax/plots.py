@@ -236,3 +236,19 @@ def plot_all(runs: Sequence[Path], out: Path) -> list[Path]:
     finally:
         pyplot.close("all")
     return drawn
+
+
+def plot_adaptation(curves: dict[str, dict[str, dict[str, float]]], task: str, out: Path) -> Path:
+    """Success against episodes of own experience, a line for each way to adapt (`finetune`)."""
+    pyplot = _pyplot()
+    figure, axis = pyplot.subplots(figsize=(6, 3.6))
+    for adapt, curve in curves.items():
+        points = [(int(n), figures["success_any"]) for n, figures in curve.items()]
+        axis.plot(*zip(*points, strict=True), "o-", ms=4, lw=1.2, label=adapt)
+    axis.set_xscale("symlog", linthresh=1)
+    axis.axhline(0.8, color="k", lw=0.6, ls=":")
+    axis.set_title(f"{task}: adapted from a policy that never saw it")
+    axis.set_xlabel("episodes of own experience")
+    axis.set_ylabel("success rate, any step")
+    axis.set_ylim(-0.03, 1.03)
+    return _finish(pyplot, figure, [axis], out)

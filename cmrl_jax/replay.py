@@ -224,7 +224,17 @@ def sample_transitions(
         n: transitions per row. An empty ring gives zeros; ask `state.size`.
     """
     task, slots = _draw(state, key, task_ids, n)
-    rows = state.rows[task, slots]  # (row, n, width)
+    return _context_batch(state, state.rows[task, slots])
+
+
+def stored_transitions(state: ReplayState) -> tuple[ContextBatch, jax.Array]:
+    """Every slot of a ring as transitions (task, capacity, ...), and which are filled, 1 or 0."""
+    slots = jnp.arange(state.rows.shape[1])
+    mask = jnp.broadcast_to(slots < state.size, state.rows.shape[:2])
+    return _context_batch(state, state.rows), mask.astype(jnp.float32)
+
+
+def _context_batch(state: ReplayState, rows: jax.Array) -> ContextBatch:
     end_of_obs, end_of_action = state.obs_size, state.obs_size + state.action_size
     return ContextBatch(
         obs=rows[..., :end_of_obs],
@@ -232,10 +242,6 @@ def sample_transitions(
         reward=rows[..., end_of_action],
         next_obs=rows[..., end_of_action + 4 :],
     )
-
-
-add_context = add
-sample_context = sample_transitions
 
 
 def _draw(

@@ -34,6 +34,7 @@ def rollout(
     horizon: int,
     deterministic: bool = False,
     random_actions: jax.Array | bool = False,
+    noise: jax.Array | None = None,
 ) -> tuple[State, Transition, StepStats]:
     """Runs `steps` control steps of every lane.
 
@@ -43,6 +44,7 @@ def rollout(
         zc: conditioning (lane, conditioning), fixed for these steps.
         horizon: control steps of an episode; the transition that ends it is truncated.
         random_actions: () bool; uniform actions in place of the policy's.
+        noise: (steps, lane, act) standard normal, in place of independent draws.
 
     Returns:
         The new states, and transitions and statistics with leading axes (time, lane).
@@ -50,9 +52,13 @@ def rollout(
     actor_params, obs_stats = policy
     lanes = state.obs.shape[0]
 
-    def step(state: State, key: jax.Array):
+    def step(state: State, inputs: tuple[jax.Array, jax.Array | None]):
+        key, step_noise = inputs
         k_act, k_uniform = jax.random.split(key)
-        action, _ = learner.policy(actor_params, obs_stats, state.obs, zc, k_act, deterministic)
+        given = () if step_noise is None else (step_noise,)
+        action, _ = learner.policy(
+            actor_params, obs_stats, state.obs, zc, k_act, deterministic, *given
+        )
         uniform = jax.random.uniform(k_uniform, (lanes, ACTION_SIZE), minval=-1.0, maxval=1.0)
         action = jnp.where(random_actions, uniform, action)
         new = jax.vmap(env.step)(state, action)
@@ -67,5 +73,25 @@ def rollout(
         )
         return new, (transition, StepStats(new.success, new.distance))
 
-    state, (transitions, stats) = jax.lax.scan(step, state, jax.random.split(key, steps))
+    inputs = (jax.random.split(key, steps), noise)
+    state, (transitions, stats) = jax.lax.scan(step, state, inputs)
     return state, transitions, stats
+
+
+def correlated_noise(
+    key: jax.Array, steps: int, shape: tuple[int, ...], correlation: float
+) -> jax.Array:
+    """Standard normal noise (steps, *shape) whose successive steps correlate; 0 is white noise.
+
+    A first-order autoregressive process: each step's density is the policy's own, but a lane keeps
+    to a direction for about 1 / (1 - correlation) steps, where white noise cancels itself out.
+    """
+    fresh = jax.random.normal(key, (steps, *shape))
+    scale = (1.0 - correlation**2) ** 0.5
+
+    def step(noise: jax.Array, fresh: jax.Array):
+        noise = correlation * noise + scale * fresh
+        return noise, noise
+
+    _, later = jax.lax.scan(step, fresh[0], fresh[1:])
+    return jnp.concatenate([fresh[:1], later])

@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 RUNS, RESULTS = Path("runs/experiments"), Path("results")
 CSV_ROWS = 100  # kept of a run's metrics
 
-BUDGET = "--env.physics native --train.env_steps 1200000"
+BUDGET = "--env.physics native --train.env_steps 960000"
 SINGLE = "--config sac.yaml --env.physics native"  # 500,000 env steps
 CMRL = f"--config ml4.yaml {BUDGET}"
 

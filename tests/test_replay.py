@@ -129,8 +129,8 @@ def test_context_samples_are_whole_transitions_of_their_task():
     state = replay.init_context(TASKS, 1, STEPS, LANES, OBS, ACT)
     assert state.rows.shape[1] == CAPACITY
     steps = make_steps(0, 13)
-    state = replay.add_context(state, steps)
-    batch = replay.sample_context(state, jax.random.key(5), jnp.array([1, 0]), 50)
+    state = replay.add(state, steps)
+    batch = replay.sample_transitions(state, jax.random.key(5), jnp.array([1, 0]), 50)
     time = np.asarray(batch.obs[..., 0]).astype(int)
     lane = np.asarray(batch.obs[..., 1]).astype(int)
     task = np.array([1, 0])[:, None]

@@ -90,7 +90,7 @@ def train_and_evaluate():
 
     def posterior_z(state, ring, key, reward_sign=1.0):
         k_context, k_z = jax.random.split(key)
-        context = replay.sample_context(ring, k_context, jnp.arange(TASKS), CONTEXT)
+        context = replay.sample_transitions(ring, k_context, jnp.arange(TASKS), CONTEXT)
         context = replace(context, reward=reward_sign * context.reward)
         posterior = inference.posterior(state.encoder_params, context, jnp.ones((TASKS, CONTEXT)))
         lanes = jax.tree.map(lambda x: jnp.repeat(x[:, None], LANES, axis=1), posterior)
