@@ -156,7 +156,7 @@ class MetaWorldAgent:
             self._origin[self._starts] = obs[self._starts][:, OBJECT]
             self._starts[:] = False
         actions, shown = self._functions["act"](
-            obs, self._origin, self._zc, jax.random.fold_in(self._key, self._steps)
+            obs, self._origin, self._zc, self._key, np.int32(self._steps)
         )
         self._steps += 1
         self._acted[:] = True
@@ -195,12 +195,17 @@ def _compile(
     params = jax.device_put(params)
 
     @jax.jit
-    def act(obs, origin, zc, key):
+    def act(obs, origin, zc, key, step):
         shown = obs
         if config.env.obs_mode == "canonical":
             shown = canonical_obs(obs, origin, config.env.goal_observable)
         action, _ = learner.policy(
-            params.actor_params, params.obs_stats, shown, zc, key, deterministic
+            params.actor_params,
+            params.obs_stats,
+            shown,
+            zc,
+            jax.random.fold_in(key, step),
+            deterministic,
         )
         return action, shown
 
