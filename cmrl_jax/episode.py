@@ -21,7 +21,7 @@ from cmrl_jax.context import Belief, ContextInference
 from cmrl_jax.learner import Learner
 from cmrl_jax.replay import Transition
 from cmrl_jax.rollout import rollout
-from envs.sawyer import Ml4Env
+from envs.sawyer import ACTION_SIZE, Ml4Env
 
 Array = jax.Array | np.ndarray
 
@@ -139,16 +139,20 @@ def make_episode(config: Config, env: Ml4Env, learner: Learner, horizon: int) ->
             keys = jax.vmap(noise_key, in_axes=(None, 0))(key, lanes.lane_id)
             zc = inference.z_of_noise(posterior, lane_noise(keys, inference.latent_dim))
 
-        def policy(actor_params, obs_stats, obs, zc, key, deterministic):
-            """The learner's policy for lanes of several policies, each lane with its own noise."""
-            keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, lanes.lane_id)
-            of_lanes = jax.vmap(learner.policy, in_axes=(None, None, 0, 0, 0, None))
-            of_policies = jax.vmap(of_lanes, in_axes=(0, 0, 0, 0, None, None))
-            obs, zc = by_policy(obs), by_policy(zc)
-            action, _ = of_policies(actor_params, obs_stats, obs, zc, keys, deterministic)
+        def policy(actor_params, obs_stats, obs, zc, key, deterministic, noise):
+            """The learner's policy for lanes of several policies."""
+            act = jax.vmap(learner.policy, in_axes=(0, 0, 0, 0, None, None, 0))
+            rows = (by_policy(x) for x in (obs, zc))
+            action, _ = act(actor_params, obs_stats, *rows, key, deterministic, by_policy(noise))
             return flat(action), None
 
         actor = replace(learner, policy=policy)
+
+        def lane_actions(key):
+            """Noise of a chunk's actions (time, lane, act), each lane's its own."""
+            keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, lanes.lane_id)
+            noise = jax.vmap(lambda k: jax.random.normal(k, (chunk, ACTION_SIZE)), out_axes=1)(keys)
+            return jnp.tile(noise, (1, policies, 1))
 
         def run_chunk(carry, key):
             state, belief = carry
@@ -162,6 +166,7 @@ def make_episode(config: Config, env: Ml4Env, learner: Learner, horizon: int) ->
                 chunk,
                 horizon,
                 deterministic=deterministic,
+                noise=lane_actions(key),
             )
             if inference is not None:
                 by_lane = jax.tree.map(lambda x: by_policy(jnp.swapaxes(x, 0, 1)), transitions)
