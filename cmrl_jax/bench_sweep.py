@@ -1,15 +1,22 @@
-"""`train.py sweep --compare N`: the sweep's cells taken one adaptation run at a time.
+"""`train.py sweep --compare N`: the sweep's cells taken one checkpoint and one goal at a time.
 
-The baseline is the loop one would write first: for each checkpoint, task and goal one call of a
-program that is compiled once, for a single lane. It is given that program for free, as the sweep
-is; both are timed in one process on one device.
+Two baselines, both with every k from one adaptation run, as the sweep has them:
+
+* a loop in this process: for each checkpoint, task and goal one call of a program that is compiled
+  once, for a single lane. Compiling counts for neither side.
+* the command `eval` for each of them, its programs in the compilation cache. Start-up and compiling
+  count for both sides.
 """
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +27,8 @@ from cmrl_jax.scores import ScoreCsv, cell_rows, of_policy
 from cmrl_jax.session import Session
 from cmrl_jax.targets import Target, columns_of, load_target
 from cmrl_jax.trials import trial_of
+
+COMMANDS = 2  # calls of `eval` that are timed: each takes seconds to start
 
 
 def time_one_by_one(
@@ -32,8 +41,8 @@ def time_one_by_one(
         table: the sweep's rows, to compare with.
 
     Returns:
-        `cells`, `seconds`, `cells_per_s`, `compile_seconds`; `equal_success`, cells whose success
-        at any step is the sweep's; `largest_return_difference`.
+        `cells`, `seconds`, `compile_seconds`; `equal_success`, cells whose success at any step is
+        the sweep's; `largest_return_difference`.
     """
     lanes = [
         (target, task, goal)
@@ -70,8 +79,53 @@ def time_one_by_one(
     return {
         "cells": len(rows),
         "seconds": seconds,
-        "cells_per_s": len(rows) / seconds,
         "compile_seconds": compiled - started,
         "equal_success": sum(equal),
         "largest_return_difference": max(differs),
     }
+
+
+def time_commands(target: Target, options: EvalOptions) -> dict[str, Any]:
+    """Runs `eval` on the first goal of `COMMANDS` tasks, after one that fills the cache.
+
+    Returns:
+        `cells`, `seconds`.
+    """
+    program = "import sys; from cmrl_jax.cli import main; sys.exit(main())"
+    root = Path(__file__).resolve().parent.parent
+    paths = os.pathsep.join(p for p in (str(root), os.environ.get("PYTHONPATH")) if p)
+    started = 0.0
+    for call in range(COMMANDS + 1):
+        if call == 1:
+            started = time.monotonic()
+        task = target.tasks[call % len(target.tasks)]
+        subprocess.run(
+            [sys.executable, "-c", program, "eval", *command_words(target, options, task)],
+            check=True,
+            capture_output=True,
+            env=os.environ | {"PYTHONPATH": paths},
+        )
+    return {"cells": COMMANDS * len(target.k), "seconds": time.monotonic() - started}
+
+
+def command_words(target: Target, options: EvalOptions, task: str) -> list[str]:
+    """Flags of `eval` for one goal of one task under a sweep's protocol."""
+    flags = {
+        "run": target.run,
+        "checkpoint": target.checkpoint,
+        "tasks": task,
+        "k": ",".join(map(str, target.k)),
+        "goals": 1,
+        "goal-set": options.goal_set,
+        "seed": options.seed,
+        "horizon": options.horizon,
+        "physics": options.physics,
+        "policy": options.policy,
+        "z": options.z,
+        "paraphrases": options.paraphrases,
+        "text-control": options.text_control,
+        "text": options.text,
+        "weights": options.weights,
+    }
+    words = [w for name, x in flags.items() if x is not None for w in (f"--{name}", str(x))]
+    return [*words, "--any-table"] if options.any_table else words

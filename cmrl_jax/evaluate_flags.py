@@ -147,7 +147,7 @@ def sweep_parser() -> argparse.ArgumentParser:
         type=natural,
         default=0,
         metavar="N",
-        help="time N adaptation runs one at a time, too [0]",
+        help="time N adaptation runs one at a time, and eval as a command, too [0]",
     )
     return parser
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cmrl_jax.bench_sweep import time_one_by_one
+from cmrl_jax.bench_sweep import time_commands, time_one_by_one
 from cmrl_jax.config import TASKS
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import EvalOptions
@@ -181,16 +181,23 @@ def compared(
     count: int,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Times some of the cells one adaptation run at a time, beside the rate of the sweep."""
-    found = time_one_by_one(members, options, table, count)
-    swept = progress.cells / progress.seconds if progress.seconds else None
-    found["sweep_cells_per_s"] = swept
-    found["ratio"] = swept / found["cells_per_s"] if swept else None
-    print(
-        f"one by one: {found['cells']} cells, {found['cells_per_s']:.2f} cells/s; "
-        + (f"the sweep is {found['ratio']:.1f} times as fast" if swept else "nothing was swept")
-    )
-    print(f"success as in the sweep in {found['equal_success']} of {found['cells']} cells")
+    """Times some of the cells one checkpoint and one goal at a time, beside what the sweep took."""
+    compiling = progress.compile_seconds
+    baselines = {
+        "loop": (time_one_by_one(members, options, table, count), 0.0),
+        "commands": (time_commands(members[0], options), compiling),
+    }
+    found = {}
+    for name, (taken, overhead) in baselines.items():
+        rate = taken["cells"] / taken["seconds"]
+        seconds = progress.seconds + overhead
+        swept = progress.cells / seconds if progress.cells else None
+        ratio = swept / rate if swept else None
+        found[name] = taken | {"cells_per_s": rate, "sweep_cells_per_s": swept, "ratio": ratio}
+        faster = f"the sweep is {ratio:.1f} times as fast" if ratio else "nothing was swept"
+        print(f"one by one ({name}): {taken['cells']} cells, {rate:.2f} cells/s; {faster}")
+    loop = found["loop"]
+    print(f"success as in the sweep in {loop['equal_success']} of {loop['cells']} cells")
     return found
 
 

@@ -2,15 +2,21 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import pytest
 from policy_fixtures import save_run, small_config
 
+from cmrl_jax import bench_sweep
 from cmrl_jax import sweep as sweep_module
+from cmrl_jax.bench_sweep import command_words
 from cmrl_jax.cli import main
 from cmrl_jax.evaluate import Evaluator
+from cmrl_jax.evaluate_flags import eval_parser, options_of, sweep_parser
+from cmrl_jax.flags import parse
 from cmrl_jax.session import Session
 from cmrl_jax.sweep import INTERRUPTED
+from cmrl_jax.targets import targets_of
 from cmrl_jax.trials import Plan, fitted, plan_batches
 
 GOALS, KS, TASKS = 3, ("0", "2"), 4
@@ -155,13 +161,28 @@ def test_short_memory_makes_smaller_batches(runs, swept, monkeypatch, capsys):
             assert returns[0] == pytest.approx(returns[1], 1e-4)
 
 
-def test_compare_takes_the_same_cells_one_by_one(runs, tmp_path):
+def test_compare_takes_the_same_cells_one_by_one(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_sweep, "COMMANDS", 1)
     path = tmp_path / "c.json"
     assert sweep(runs, None, "--compare", "5", "--json", str(path)) == 0
     found = json.loads(path.read_text())["one_by_one"]
-    assert found["cells"] == 5 * len(KS) == found["equal_success"]
-    assert found["largest_return_difference"] < 1e-3
-    assert found["ratio"] == pytest.approx(found["sweep_cells_per_s"] / found["cells_per_s"])
+    loop, commands = found["loop"], found["commands"]
+    assert loop["cells"] == 5 * len(KS) == loop["equal_success"]
+    assert loop["largest_return_difference"] < 1e-3
+    assert commands["cells"] == len(KS)
+    for baseline in (loop, commands):
+        assert baseline["cells_per_s"] == pytest.approx(baseline["cells"] / baseline["seconds"])
+        ratio = baseline["sweep_cells_per_s"] / baseline["cells_per_s"]
+        assert baseline["ratio"] == pytest.approx(ratio)
+
+
+def test_the_compared_command_is_the_sweeps_protocol(runs):
+    words = [*PROTOCOL, "--policy", "sampled", "--any-table", "--horizon", "4"]
+    options = options_of(parse(sweep_parser(), ["--runs", "x", *words]))
+    [target] = targets_of(runs / "b", "all", options)
+    again = parse(eval_parser(), command_words(target, options, "window-open"))
+    assert (again.run, again.checkpoint) == (runs / "b", 1)
+    assert options_of(again) == replace(options, tasks=("window-open",), goals=1)
 
 
 def test_missing_checkpoints_are_named(runs, refused, tmp_path):
