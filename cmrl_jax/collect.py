@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from cmrl_jax import normalizers
+from cmrl_jax import normalizers, parallel
 from cmrl_jax import replay as rings
 from cmrl_jax.config import Config, lane_groups, lanes_per_task
 from cmrl_jax.diagnostics import make_diagnose
@@ -133,10 +133,10 @@ def make_train_iteration(
     def reset_lanes(key: jax.Array) -> State:
         lane_key = jax.vmap(lambda lane: jax.random.fold_in(key, lane))(jnp.arange(lanes))
         if placements is None:
-            return jax.vmap(env.reset)(lane_key, env_task)
+            return parallel.by_part(jax.vmap(env.reset))(lane_key, env_task)
         goals = placements.shape[1]
         goal = jax.vmap(lambda k: jax.random.randint(k, (), 0, goals))(lane_key)
-        return jax.vmap(env.reset_to)(env_task, placements[train_task, goal])
+        return parallel.by_part(jax.vmap(env.reset_to))(env_task, placements[train_task, goal])
 
     @jax.jit  # so that `skip_steps`, which only asks for shapes, does not trace it once more
     def train_steps(run: RunState, key: jax.Array) -> tuple[RunState, dict[str, jax.Array]]:
@@ -181,7 +181,7 @@ def make_train_iteration(
                 random_actions=random_actions,
                 noise=chunk_noise,
             )
-            run = store(run, jax.tree.map(by_task, transitions))
+            run = store(run, jax.tree.map(by_task, parallel.gather(transitions)))
             run, metrics = jax.lax.cond(is_first, skip_steps, train_steps, run, k_update)
             return (run, state), (metrics, transitions.reward, stats)
 

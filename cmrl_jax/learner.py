@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from cmrl_jax import normalizers, replay
+from cmrl_jax import normalizers, parallel, replay
 from cmrl_jax.config import Config, lanes_per_task
 from cmrl_jax.context import ContextInference, context_mask, make_context_inference
 from cmrl_jax.distributions import sample_tanh_gaussian
@@ -190,6 +190,7 @@ def make_learner(
         noise = jax.random.normal(k_normal, (rows, 2 * actions + latent_dim))
         action_noise = noise[:, : 2 * actions].reshape(rows, 2, sac.batch, action_size)
         batch = replay.sample(replay_state, k_batch, task_ids, sac.batch, sac.n_step, sac.gamma)
+        batch, action_noise = parallel.split(batch, 1), parallel.split(action_noise, 2)
         scale = sac.reward_scale / normalizers.reward_denominator(state.return_stats, sac)
         data = Minibatch(
             task_ids=task_ids,

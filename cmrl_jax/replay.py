@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from cmrl_jax import parallel
+
 
 @struct.dataclass
 class Transition:
@@ -159,7 +161,13 @@ def add(state: ReplayState, transitions: Transition) -> ReplayState:
         return ring, (index + lanes) % capacity
 
     num_steps = rows.shape[0]
-    ring, index = jax.lax.fori_loop(0, num_steps, write_step, (state.rows, state.index))
+    if parallel.is_split():  # by slot: a scatter lets every device write its own, a slice does not
+        slots = (state.index + jnp.arange(num_steps * lanes)) % capacity
+        by_slot = jnp.swapaxes(rows, 0, 1).reshape(rows.shape[1], -1, rows.shape[-1])
+        ring = parallel.split(state.rows.at[:, slots].set(by_slot, unique_indices=True), axis=1)
+        index = (state.index + num_steps * lanes) % capacity
+    else:
+        ring, index = jax.lax.fori_loop(0, num_steps, write_step, (state.rows, state.index))
     size = jnp.minimum(state.size + num_steps * lanes, capacity)
     return replace(state, rows=ring, index=index, size=size)
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmrl_jax import parallel
 from cmrl_jax.learner import Learner
 from cmrl_jax.replay import Transition
 from envs.sawyer import ACTION_SIZE, Ml4Env, State
@@ -61,7 +62,7 @@ def rollout(
         )
         uniform = jax.random.uniform(k_uniform, (lanes, ACTION_SIZE), minval=-1.0, maxval=1.0)
         action = jnp.where(random_actions, uniform, action)
-        new = jax.vmap(env.step)(state, action)
+        new = parallel.by_part(jax.vmap(env.step))(state, action)
         transition = Transition(
             obs=state.obs,
             action=action,

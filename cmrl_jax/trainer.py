@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from cmrl_jax import parallel
 from cmrl_jax.checkpoint import full_store, join_run, policy_store, split_run
 from cmrl_jax.collect import (
     RunState,
@@ -42,6 +43,7 @@ from cmrl_jax.run_dir import write_text
 from cmrl_jax.scores import format_scores, of_policy, summarise
 from cmrl_jax.session import Session, policy_params, prepare_jax
 from cmrl_jax.stop import StopSignal
+from cmrl_jax.validate import check_devices
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
 
@@ -100,6 +102,8 @@ class _Run:
 
     def go(self, resume: bool) -> int:
         self.say(f"device: {prepare_jax(self.config)}")
+        mesh = parallel.make_mesh()
+        check_devices(self.config, parallel.size(mesh))
         self.session = Session(self.config)
         iteration = make_train_iteration(
             self.config,
@@ -108,11 +112,15 @@ class _Run:
             self.session.train_goals,
             self.session.train_placements(),
         )
+        init = lambda key: init_run(self.config, self.session.learner, key)
+        abstract = parallel.placed(jax.eval_shape(init, jax.random.key(0)), mesh)
+        places = jax.tree.map(lambda leaf: leaf.sharding, abstract)
         # Jitted, so that every leaf has a buffer of its own: the iteration donates them all.
-        self.init = jax.jit(lambda key: init_run(self.config, self.session.learner, key))
-        abstract = jax.eval_shape(self.init, jax.random.key(0))
-        # Traced once, for the columns and for the program: tracing the physics takes seconds.
-        traced = jax.jit(iteration, donate_argnums=0).trace(abstract)
+        self.init = jax.jit(init, out_shardings=places)
+        with parallel.using(mesh):
+            # Traced once, for the columns and for the program: tracing the physics takes seconds.
+            program = jax.jit(iteration, donate_argnums=0, out_shardings=(places, None))
+            traced = program.trace(abstract)
         self.start(abstract, self.columns(traced.out_info[1]), resume)
         try:
             if self.iterations_left() and not self.stop.requested:
@@ -257,7 +265,7 @@ class _Run:
         return row | {"time/evaluation_s": time.monotonic() - started}
 
     def scores(self, goals: int, k: tuple[int, ...]) -> dict[str, Any]:
-        params = policy_params(self.state.learner)
+        params = parallel.on_one_device(policy_params(self.state.learner))
         trial = self.session.trial(self.config.eval.goal_set, goals)
         if not self.evaluator.is_compiled:
             width = trial.texts.shape[-1]

@@ -6,6 +6,8 @@ anything is compiled, and import neither jax nor mujoco.
 
 from __future__ import annotations
 
+import math
+
 from cmrl_jax.config import (
     GOAL_ABLATIONS,
     TASKS,
@@ -154,6 +156,25 @@ def check_goal_table(table: str) -> None:
         f"'{table}' (goals.table) is no goal table",
         f"{suggest(table, valid)}valid: {', '.join(valid)}, or the path of an .npz",
     )
+
+
+def check_devices(config: Config, devices: int) -> None:
+    """Raises ConfigError unless lanes, rings and batches divide evenly among the devices."""
+    tasks, per_task = len(config.tasks.train), lanes_per_task(config)
+    prior_only = config.collect.context_lanes == "prior"
+    episode = config.env.horizon * (lane_groups(config)[0] if prior_only else per_task)
+    sizes = (
+        ("collect.lanes", config.collect.lanes, tasks, 1),
+        ("train.capacity", config.train.capacity, per_task, 1),
+        ("collect.context_episodes", config.collect.context_episodes, 1, episode),
+        ("sac.batch", config.sac.batch, 1, 1),
+    )
+    for name, value, multiple, unit in sizes:
+        step = math.lcm(multiple, devices // math.gcd(devices, unit))
+        cause = f"{name} {value} cannot be divided among {devices} devices"
+        fewer = "show fewer devices (CUDA_VISIBLE_DEVICES, JAX_NUM_CPU_DEVICES)"
+        cure = f"set {name}: {-(-value // step) * step}, or {fewer}"
+        _require(value * unit % devices == 0, cause, cure)
 
 
 def check_goal_set(name: str, key: str) -> None:

@@ -3,7 +3,8 @@
 A run that is finished is left alone, one that was stopped is resumed, so this command can be
 stopped (Ctrl-C, SIGTERM) and given again at any time. Runs go to runs/experiments/NAME; what
 results/ keeps of each (config, versions, thinned metrics, evaluation) is copied to results/NAME.
-`--list` prints the commands. All runs have one budget, BUDGET, but for the single-task ones.
+`--list` prints the commands. All runs have one budget, BUDGET, but for the single-task ones and the
+multi-task ceiling.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ CMRL = f"--config ml4.yaml {BUDGET}"
 EXPERIMENTS = {
     "cmrl-seed0": CMRL,
     "cmrl-seed1": f"{CMRL} --seed 1",
-    "mtsac": f"--config mtsac.yaml {BUDGET}",
+    "mtsac": "--config mtsac.yaml --env.physics native --train.env_steps 960000",
     "pearl": f"--config pearl.yaml {BUDGET}",
     "sac-drawer-close": f"{SINGLE} --tasks.train drawer-close",
     "sac-window-open": f"{SINGLE} --tasks.train window-open",

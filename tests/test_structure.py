@@ -63,7 +63,7 @@ ROWS = (
     {"losses", "objectives", "context", "replay"},
     {"networks", "layers", "distributions", "normalizers", "goals", "run_dir", "config_io"},
     {"goal_files"},
-    {"manifest", "named_arrays"},
+    {"manifest", "named_arrays", "parallel"},
     {"validate"},
     {"config"},
 )

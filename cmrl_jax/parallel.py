@@ -1,0 +1,97 @@
+"""Data parallelism over the local devices: lanes, rings and batches are split over one axis.
+
+Everything learned is replicated, the loss stays a mean over the whole batch, and XLA inserts the
+communication: one program text for 1 to N devices. The mesh is jax's ambient one, in force while a
+program is traced. With one device there is none, and nothing here changes the program.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+AXIS = "data"
+
+
+def make_mesh() -> Mesh | None:
+    """All local devices on one axis; None with a single one."""
+    devices = jax.local_devices()
+    if len(devices) == 1:
+        return None
+    # MJX is not written for explicit axes, the default.
+    return jax.make_mesh((len(devices),), (AXIS,), (jax.sharding.AxisType.Auto,), devices=devices)
+
+
+def size(mesh: Mesh | None) -> int:
+    """Devices of a mesh."""
+    return 1 if mesh is None else mesh.size
+
+
+def using(mesh: Mesh | None) -> contextlib.AbstractContextManager[Any]:
+    """Puts the mesh in force, for what is traced inside."""
+    return contextlib.nullcontext() if mesh is None else jax.set_mesh(mesh)
+
+
+def is_split() -> bool:
+    """Whether a mesh is in force."""
+    return not jax.sharding.get_abstract_mesh().empty
+
+
+def split(tree: Any, axis: int = 0) -> Any:
+    """The arrays of a traced tree with one axis split over the devices.
+
+    Args:
+        axis: its length is divisible by their number (`validate.check_devices`).
+    """
+    return _constrain(tree, PartitionSpec(*[None] * axis, AXIS))
+
+
+def gather(tree: Any) -> Any:
+    """The arrays of a traced tree whole on every device."""
+    return _constrain(tree, PartitionSpec())
+
+
+def by_part(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of arrays with a leading lane axis, run by each device on its own lanes.
+
+    For what treats lanes one by one: loops, solvers and host callbacks then stay on their device.
+    """
+    if not is_split():
+        return function
+    lanes = PartitionSpec(AXIS)
+    return jax.shard_map(function, in_specs=lanes, out_specs=lanes, check_vma=False)
+
+
+def _constrain(tree: Any, spec: PartitionSpec) -> Any:
+    if not is_split():
+        return tree
+    return jax.tree.map(lambda x: jax.lax.with_sharding_constraint(x, spec), tree)
+
+
+def placed(run: Any, mesh: Mesh | None) -> Any:
+    """The shapes of a `collect.RunState` with where each array lies.
+
+    Rings are split by slot, all else is on every device; without a mesh jax's default stays.
+    """
+    if mesh is None:
+        return run
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    by_slot = NamedSharding(mesh, PartitionSpec(None, AXIS))
+
+    def place(leaf: Any, where: NamedSharding) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where)
+
+    whole = jax.tree.map(lambda leaf: place(leaf, everywhere), run)
+    rings = (whole.replay, whole.context)
+    replay, context = (ring.replace(rows=place(ring.rows, by_slot)) for ring in rings)
+    return whole.replace(replay=replay, context=context)
+
+
+def on_one_device(tree: Any) -> Any:
+    """Arrays that every device holds, as one device's; for programs that run on one."""
+    devices = jax.local_devices()
+    return tree if len(devices) == 1 else jax.device_put(tree, devices[0])
