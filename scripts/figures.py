@@ -1,7 +1,7 @@
 """Every figure and table of results/ again, from the files kept there: `python scripts/figures.py`.
 
 Figures go to results/figures; the table of final evaluations, as Markdown, to standard output.
-Runs that are not there yet are left out.
+Runs that are not there yet are left out, and figures with fewer than two runs.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def table(runs: list[Path]) -> list[str]:
 def main() -> int:
     kept = lambda name: (RESULTS / name / "eval.json").is_file()
     for folder, names in FIGURES.items():
-        if runs := [RESULTS / name for name in names if kept(name)]:
+        runs = [RESULTS / name for name in names if kept(name)]
+        if len(runs) > 1:
             for path in plot_all(runs, RESULTS / "figures" / folder):
                 print(path.relative_to(ROOT), file=sys.stderr)
     listed = dict.fromkeys(name for names in FIGURES.values() for name in names)
