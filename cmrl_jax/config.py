@@ -112,7 +112,12 @@ class EncoderConfig:
     p_empty: float = doc(0.15, "probability of an empty context (needs a goal factor)", high=1)
     context_reward_scale: float = doc(0.1, "reward scale inside the context")
     information_bottleneck: bool = doc(True, "false: z is the mean of the factors, no KL")
-    aux: Literal["none", "recon", "contrastive"] = doc("none", "auxiliary head on z")
+    aux: Literal["none", "recon", "contrastive"] = doc(
+        "none",
+        "z also learns recon: to predict reward and change of the observation; contrastive: which "
+        "task's experience and which task's text belong together",
+    )
+    aux_weight: float = doc(0.1, "weight of the auxiliary loss")
     z_resample: Literal["episode", "step"] = doc("episode", "when z is redrawn in a rollout")
 
 

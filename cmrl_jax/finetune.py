@@ -76,7 +76,8 @@ def finetune_config(
         sac = replace(config.sac, reward_norm="none", reward_scale=scale, task_rows=0)
     encoder = config.encoder
     if adapt == "z":
-        encoder = replace(encoder, information_bottleneck=False)
+        # The latent stands alone: no encoder, and no decoder that its parameters would hold.
+        encoder = replace(encoder, information_bottleneck=False, aux="none")
     collect = replace(
         config.collect,
         lanes=1,

@@ -145,6 +145,49 @@ def kl_loss(
     return jnp.sum(jnp.maximum(per_dim, free_bits) if free_bits > 0 else per_dim)
 
 
+def reconstruction_loss(predicted: jax.Array, reward: jax.Array, change: jax.Array) -> jax.Array:
+    """Squared error of predicted rewards and changes of the observation (algorithm section 4.8).
+
+    Targets are standardised over the minibatch, dimension by dimension, so that a loss of 1 is
+    what a constant prediction gets; the reward counts as much as all of the observation.
+
+    Args:
+        predicted: (task, batch, 1 + obs), the reward first.
+        reward: (task, batch); change: next observation minus observation, (task, batch, obs).
+
+    Returns:
+        (task,)
+    """
+
+    def standardised(x: jax.Array) -> jax.Array:
+        scale = jnp.std(x, axis=(0, 1))
+        return (x - jnp.mean(x, axis=(0, 1))) / jnp.maximum(scale, 1e-6)
+
+    reward_error = jnp.square(predicted[..., 0] - standardised(reward))
+    change_error = jnp.mean(jnp.square(predicted[..., 1:] - standardised(change)), axis=-1)
+    return jnp.mean(0.5 * (reward_error + change_error), axis=-1)
+
+
+def contrastive_loss(experience: jax.Array, text: jax.Array, task_ids: jax.Array) -> jax.Array:
+    """Cross-entropy of pairing every row's experience with its task's text, and the reverse.
+
+    Scores are inner products of posterior means; all rows of a task are right answers alike. A
+    posterior that says nothing scores log R for R rows of different tasks (InfoNCE, van den Oord
+    et al. 2018; symmetric as in CLIP, Radford et al. 2021).
+
+    Args:
+        experience: mean of q(z | transitions), (task, latent).
+        text: mean of q(z | text), (task, latent).
+        task_ids: (task,).
+    """
+    scores = experience @ text.T  # (task, task)
+    same = (task_ids[:, None] == task_ids[None]).astype(jnp.float32)
+    target = same / jnp.sum(same, axis=-1, keepdims=True)  # symmetric: rows of a task are alike
+    by_text = -jnp.sum(target * jax.nn.log_softmax(scores, axis=1), axis=1)
+    by_experience = -jnp.sum(target * jax.nn.log_softmax(scores, axis=0), axis=0)
+    return 0.5 * jnp.mean(by_text + by_experience)
+
+
 def task_weights(log_alpha: jax.Array, balance: Literal["none", "sac_temp"]) -> jax.Array:
     """w_i = T softmax_i(-log alpha_i) without gradient, or ones; (task,) -> (task,).
 

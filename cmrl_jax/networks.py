@@ -128,13 +128,17 @@ class SoftModularNet(nn.Module):
 
 
 class ContextEncoder(nn.Module):
-    """One Gaussian factor a transition, and one of the goal text (algorithm sections 2.1 - 2.3)."""
+    """One Gaussian factor a transition, and one of the goal text (algorithm sections 2.1 - 2.3).
+
+    With `encoder.aux: recon` also the decoder that z is trained through (section 4.8).
+    """
 
     hidden: tuple[int, ...]
     latent_dim: int
     norm: bool
     goal_fusion: str
     goal_width: int
+    decoder_out: int  # 0: no decoder
     initialisers: Initialisers
 
     def setup(self) -> None:
@@ -146,11 +150,23 @@ class ContextEncoder(nn.Module):
         if self.goal_fusion in ("factor", "both"):
             hidden = (GOAL_FACTOR_HIDDEN,)
             self.goal_net = MLP(hidden, 2 * self.latent_dim, self.norm, init)
+        if self.decoder_out:
+            self.decoder = MLP(self.hidden, self.decoder_out, self.norm, init)
 
-    def __call__(self, features: jax.Array, goal: jax.Array, goal_mask: jax.Array) -> Any:
-        factors = self.transition_factors(features, goal, goal_mask)
-        has_factor = self.goal_fusion in ("factor", "both")
-        return factors, self.goal_factor(goal) if has_factor else None
+    def __call__(
+        self,
+        features: jax.Array,
+        goal: jax.Array,
+        goal_mask: jax.Array,
+        x: jax.Array,
+        zc: jax.Array,
+    ) -> None:
+        """Touches every part, so that `init` makes the parameters of all."""
+        self.transition_factors(features, goal, goal_mask)
+        if self.goal_fusion in ("factor", "both"):
+            self.goal_factor(goal)
+        if self.decoder_out:
+            self.reconstruct(x, zc)
 
     def transition_factors(
         self, features: jax.Array, goal: jax.Array | None, goal_mask: jax.Array | None
@@ -170,6 +186,10 @@ class ContextEncoder(nn.Module):
         """goal (..., G) -> the goal's own factor (..., L)."""
         projected = self.goal_projection(self.goal_norm(goal))
         return split_factor(self.goal_net(projected)[0])
+
+    def reconstruct(self, x: jax.Array, zc: jax.Array) -> jax.Array:
+        """[obs, action] (..., feature) and z -> reward and change of obs, (..., 1 + obs)."""
+        return self.decoder(x, zc)[0]
 
 
 def split_factor(y: jax.Array) -> Gaussian:
@@ -193,6 +213,8 @@ class Networks:
         init_encoder: key -> params; None without an encoder (`conditioning` is not z).
         transition_factors: (params, features, goal, goal_mask) -> Gaussian (..., context, latent).
         goal_factor: (params, goal) -> Gaussian (..., latent); None without a goal factor.
+        reconstruct: (encoder_params, obs, action, zc) -> predicted reward and change of the
+            observation, (..., 1 + obs); None without `encoder.aux`.
     """
 
     conditioning_size: int
@@ -205,6 +227,7 @@ class Networks:
     init_encoder: Callable[[jax.Array], Params] | None
     transition_factors: Callable[..., Gaussian] | None
     goal_factor: Callable[[Params, jax.Array], Gaussian] | None
+    reconstruct: Callable[[Params, jax.Array, jax.Array, jax.Array], jax.Array] | None
 
 
 def make_torso(cfg: Config, modular: bool, out: int) -> MLP | SoftModularNet:
@@ -276,7 +299,7 @@ def make_networks(
         x = jnp.concatenate([obs, action], axis=-1)
         return jax.vmap(lambda k: critic_net.init(k, x, zc))(jax.random.split(key, 2))
 
-    init_encoder = transition_factors = goal_factor = None
+    init_encoder = transition_factors = goal_factor = reconstruct = None
     if model.conditioning == "z":
         encoder_net = ContextEncoder(
             hidden=encoder.hidden,
@@ -284,10 +307,13 @@ def make_networks(
             norm=encoder.norm == "layer",
             goal_fusion=encoder.goal_fusion,
             goal_width=encoder.goal_width,
+            decoder_out=1 + obs_size if encoder.aux == "recon" else 0,
             initialisers=make_initialisers(model.init),
         )
         width = obs_size + action_size + 1 + (obs_size if encoder.use_next_obs else 0)
-        example = (jnp.zeros((1, 1, width)), jnp.zeros((1, goal_size)), jnp.zeros((1,)))
+        x = jnp.concatenate([obs, action], axis=-1)
+        goal = jnp.zeros((1, goal_size))
+        example = (jnp.zeros((1, 1, width)), goal, jnp.zeros((1,)), x, zc)
 
         def encode(params: Params, *inputs: jax.Array | None, method: str) -> Any:
             return encoder_net.apply(params, *inputs, method=method)
@@ -296,7 +322,10 @@ def make_networks(
         transition_factors = partial(encode, method="transition_factors")
         if encoder.goal_fusion in ("factor", "both"):
             goal_factor = partial(encode, method="goal_factor")
-
+        if encoder.aux == "recon":
+            reconstruct = lambda params, obs, action, zc: encode(
+                params, jnp.concatenate([obs, action], axis=-1), zc, method="reconstruct"
+            )
     return Networks(
         conditioning_size=sizes[model.conditioning],
         init_actor=lambda key: actor_net.init(key, obs, zc),
@@ -308,4 +337,5 @@ def make_networks(
         init_encoder=init_encoder,
         transition_factors=transition_factors,
         goal_factor=goal_factor,
+        reconstruct=reconstruct,
     )

@@ -1,7 +1,8 @@
 """What is differentiated with respect to what: the losses joined to the networks.
 
-Gradient routing (algorithm section 4): the encoder learns from the critic loss and the KL, nothing
-else. So z enters with its gradient in `critic`, at the trained transitions, and nowhere else.
+Gradient routing (algorithm section 4): the encoder learns from the critic loss, the KL and the
+auxiliary loss of `encoder.aux`, nothing else. So z enters with its gradient in `critic`, at the
+trained transitions, and nowhere else.
 """
 
 from __future__ import annotations
@@ -112,6 +113,7 @@ def make_objectives(
     """The objectives of one configuration; `inference` is None without an encoder."""
     sac, model = cfg.sac, cfg.model
     is_categorical = model.critic == "c51"
+    has_aux = inference is not None and cfg.encoder.aux != "none"
     support = losses.critic_support(model.critic_v_max, model.critic_bins)
 
     def infer(encoder_params: Params | None, data: Minibatch) -> tuple[jax.Array, jax.Array | None]:
@@ -153,6 +155,19 @@ def make_objectives(
         next_value = losses.soft_value(next_head, next_log_prob, alpha)
         return losses.td_target(data.reward, data.discount, next_value), None
 
+    def auxiliary(encoder_params: Params, zc: jax.Array, data: Minibatch) -> jax.Array:
+        if networks.reconstruct is not None:
+            predicted = networks.reconstruct(encoder_params, data.obs, data.action, zc[:, None])
+            change = data.next_obs - data.obs
+            return jnp.mean(losses.reconstruction_loss(predicted, data.reward, change))
+        assert inference is not None and data.context_mask is not None
+        seen, ones = jnp.ones_like(data.context_mask), jnp.ones_like(data.task_ids, jnp.float32)
+        views = [
+            inference.posterior(encoder_params, data.context, mask, data.goal, goal_mask)
+            for mask, goal_mask in ((seen, 0.0 * ones), (0.0 * seen, ones))
+        ]
+        return losses.contrastive_loss(views[0].mean, views[1].mean, data.task_ids)
+
     def critic(trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
         zc, kl = infer(trained.encoder, data)
         alpha = jnp.exp(log_alpha)[data.task_ids]
@@ -167,6 +182,9 @@ def make_objectives(
         metrics["q_mean"] = jnp.mean(expected_q(head), axis=(0, 2))
         if clipped is not None:
             metrics["clipped_target_fraction"] = clipped
+        if has_aux:
+            metrics["aux_loss"] = auxiliary(trained.encoder, zc, data)
+            loss = loss + cfg.encoder.aux_weight * metrics["aux_loss"]
         if kl is not None:
             loss = loss + cfg.kl.beta * losses.kl_loss(kl, cfg.kl.reduce, cfg.kl.free_bits)
             metrics["kl"] = jnp.sum(kl, axis=-1)

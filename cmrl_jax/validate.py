@@ -27,7 +27,6 @@ NOT_BUILT = {
     "env.impl": ("warp",),
     "model.critic": ("hlgauss",),
     "model.router_shared": (True,),
-    "encoder.aux": ("recon", "contrastive"),
     "encoder.z_resample": ("step",),
     "collect.own_context": (True,),
 }
@@ -111,6 +110,9 @@ def _check_model(config: Config) -> None:
         cause = f"collect.group_frac gives {text} of the lanes to text with {fusion}"
         cure = "set collect.group_frac: [0.5, 0.0, 0.5], or encoder.goal_fusion: both"
         _require(text == 0, cause, cure)
+        cause = f"encoder.aux contrastive with {fusion}: no text to pair experience with"
+        cure = "set encoder.aux: none, or encoder.goal_fusion: both"
+        _require(encoder.aux != "contrastive", cause, cure)
         cause = f"encoder.p_empty is {encoder.p_empty} with {fusion}"
         cure = "set encoder.p_empty: 0.0, or encoder.goal_fusion: both"
         _require(encoder.p_empty == 0, cause, cure)

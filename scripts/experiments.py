@@ -3,8 +3,8 @@
 A run that is finished is left alone, one that was stopped is resumed, so this command can be
 stopped (Ctrl-C, SIGTERM) and given again at any time. Runs go to runs/experiments/NAME; what
 results/ keeps of each (config, versions, thinned metrics, evaluation) is copied to results/NAME.
-`--list` prints the commands. All runs have one budget, BUDGET, but for the single-task ones and the
-multi-task ceiling.
+`--list` prints the commands. All runs have one budget, BUDGET, but for the single-task ones, the
+multi-task ceiling and those that ask whether words matter.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ CSV_ROWS = 100  # kept of a run's metrics
 BUDGET = "--env.physics native --train.env_steps 1200000"
 SINGLE = "--config sac.yaml --env.physics native"  # 500,000 env steps
 CMRL = f"--config ml4.yaml {BUDGET}"
+# Do words matter? Half the budget, and a KL weight at which z may carry something.
+WORDS = "--config ml4.yaml --env.physics native --train.env_steps 600000 --kl.beta 0.001"
 
 EXPERIMENTS = {
     "cmrl-seed0": CMRL,
@@ -44,6 +46,14 @@ EXPERIMENTS = {
         f"{CMRL} --encoder.goal_fusion none --encoder.p_drop_goal 0 --encoder.p_empty 0"
         " --collect.group_frac 0.5,0,0.5"
     ),
+    "words-contrastive": f"{WORDS} --encoder.aux contrastive",
+    "words-all": (
+        f"{WORDS} --encoder.aux contrastive --env.obs_mode canonical --model.router_input z"
+        " --encoder.p_empty 0.5 --encoder.p_drop_goal 0"
+    ),
+    "words-kl": WORDS,
+    "words-recon": f"{WORDS} --encoder.aux recon",
+    "words-canonical": f"{WORDS} --env.obs_mode canonical",
 }
 
 

@@ -110,8 +110,6 @@ RULES = [
     ("env.impl=warp", "env.impl warp is not built yet"),
     ("model.critic=hlgauss", "model.critic hlgauss is not built yet"),
     ("model.router_shared=true", "model.router_shared true is not built yet"),
-    ("encoder.aux=recon", "encoder.aux recon is not built yet"),
-    ("encoder.aux=contrastive", "encoder.aux contrastive is not built yet"),
     ("encoder.z_resample=step", "encoder.z_resample step is not built yet"),
     ("collect.own_context=true", "collect.own_context true is not built yet"),
     ("encoder.goal_fusion=none", "0.25 of the lanes to text with encoder.goal_fusion none"),
@@ -119,6 +117,10 @@ RULES = [
     (
         "encoder.goal_fusion=none collect.group_frac=0.5,0,0.5",
         "encoder.p_empty is 0.15 with encoder.goal_fusion none",
+    ),
+    (
+        "encoder.goal_fusion=none collect.group_frac=0.5,0,0.5 encoder.aux=contrastive",
+        "encoder.aux contrastive with encoder.goal_fusion none",
     ),
     ("model.conditioning=task_id", "['window-close'] with model.conditioning task_id"),
     ("model.conditioning=none tasks.test=", "model.net soft with model.conditioning none"),
@@ -183,7 +185,8 @@ def test_ml4_names_every_key_that_matters():
     left_out = {name for name, _, _ in leaves(Config()) if "." in name} - named
     assert left_out == {
         "model.mlp_hidden", "model.router_shared", "model.critic_bins", "model.critic_v_max",
-        "model.critic_agg", "encoder.aux", "encoder.z_resample", "collect.own_context",
+        "model.critic_agg", "encoder.aux", "encoder.aux_weight", "encoder.z_resample",
+        "collect.own_context",
     }  # fmt: skip
 
 

@@ -59,6 +59,8 @@ VARIANTS = {
         "sac": {"variant": "v", "alpha": "fixed", "task_reduce": "sum"},
         "collect": {"context_source": "all"},
     },
+    "recon": {"encoder": {"aux": "recon"}},
+    "contrastive": {"encoder": {"aux": "contrastive"}},
     "mtsac": {"model": {"net": "mlp", "conditioning": "task_id"}},
     "sac": {"model": {"net": "mlp", "conditioning": "none"}},
 }
@@ -351,6 +353,37 @@ def test_routing_health_matches_loops():
                 gap = np.abs(rows[i].mean(0) - rows[j].mean(0))
                 total, pairs = total + np.mean(0.5 * np.sum(gap, -1)), pairs + 1
     np.testing.assert_allclose(distance, total / pairs, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("aux", "part", "first_loss"),
+    [("recon", "decoder", 1.0), ("contrastive", "goal_net", np.log(TASKS))],
+)
+def test_the_auxiliary_loss_reaches_the_encoder_side_alone(ring, aux, part, first_loss):
+    """Beside the same step without it: actor and critics move alike, the encoder does not."""
+    made = build(tiny_config(encoder={"aux": aux}))
+    silent = build(tiny_config(encoder={"aux": aux, "aux_weight": 0.0}))
+    after, metrics = jax.jit(made.learner.update)(made.state, ring, ring, jax.random.key(5))
+    other, _ = jax.jit(silent.learner.update)(silent.state, ring, ring, jax.random.key(5))
+    for name in ("critic_params", "actor_params"):
+        for a, b in zip(
+            jax.tree.leaves(getattr(after, name)),
+            jax.tree.leaves(getattr(other, name)),
+            strict=True,
+        ):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+    moved = {
+        path[1].key
+        for (path, a), b in zip(
+            jax.tree_util.tree_leaves_with_path(after.encoder_params),
+            jax.tree.leaves(other.encoder_params),
+            strict=True,
+        )
+        if not np.allclose(a, b, rtol=1e-4, atol=1e-6)
+    }
+    assert {part, "transition_net"} <= moved
+    # Heads start near zero: nothing is told apart yet.
+    assert float(metrics["aux_loss"]) == pytest.approx(first_loss, abs=0.05)
 
 
 def test_rows_are_averaged_per_task():

@@ -39,6 +39,53 @@ def test_target_and_losses_match_loops():
         np.testing.assert_allclose(got_value[i], value_loss / BATCH, rtol=1e-5)
 
 
+def test_reconstruction_is_measured_in_standard_deviations():
+    """A loop; and a constant prediction of the mean scores 1 whatever the units are."""
+    rng = np.random.default_rng(1)
+    rewards = rng.normal(5.0, 1e-3, (TASKS, BATCH))
+    change = rng.normal(0.0, [1e-2, 3.0], (TASKS, BATCH, 2))
+    predicted = rng.normal(size=(TASKS, BATCH, 3))
+    got = losses.reconstruction_loss(*map(jnp.asarray, (predicted, rewards, change)))
+    for i in range(TASKS):
+        total = 0.0
+        for b in range(BATCH):
+            r = (rewards[i, b] - rewards.mean()) / rewards.std()
+            d = [(change[i, b, k] - change[..., k].mean()) / change[..., k].std() for k in (0, 1)]
+            errors = [(predicted[i, b, 1 + k] - d[k]) ** 2 for k in (0, 1)]
+            total += 0.5 * ((predicted[i, b, 0] - r) ** 2 + sum(errors) / 2)
+        np.testing.assert_allclose(got[i], total / BATCH, rtol=1e-2)  # rewards near 5, float32
+    constant = losses.reconstruction_loss(
+        jnp.zeros((TASKS, BATCH, 3)), jnp.asarray(1e3 * rewards), jnp.asarray(change)
+    )
+    np.testing.assert_allclose(jnp.mean(constant), 1.0, rtol=1e-2)
+    still = losses.reconstruction_loss(
+        jnp.zeros((TASKS, BATCH, 3)), jnp.ones((TASKS, BATCH)), jnp.zeros((TASKS, BATCH, 2))
+    )
+    assert np.all(still == 0.0)  # what never changes is predicted by nothing
+
+
+def test_contrastive_loss_matches_a_loop_and_prefers_the_right_pairs():
+    rng = np.random.default_rng(2)
+    ids = np.array([0, 1, 0, 2])
+    a, b = rng.normal(size=(2, 4, 3))
+    got = losses.contrastive_loss(jnp.asarray(a), jnp.asarray(b), jnp.asarray(ids))
+    total = 0.0
+    for i in range(4):
+        for scores in (b @ a[i], a @ b[i]):
+            p = np.exp(scores) / np.exp(scores).sum()
+            right = np.flatnonzero(ids == ids[i])
+            total -= np.log(p[right]).mean() / (2 * 4)
+    np.testing.assert_allclose(got, total, rtol=1e-5)
+    told_apart = jnp.asarray(5.0 * np.eye(3))
+    order = jnp.arange(3)
+    assert losses.contrastive_loss(told_apart, told_apart, order) < 0.01
+    assert losses.contrastive_loss(told_apart, jnp.roll(told_apart, 1, 0), order) > 10.0
+    nothing = jnp.zeros((3, 2))
+    np.testing.assert_allclose(
+        losses.contrastive_loss(nothing, told_apart[:, :2], order), np.log(3)
+    )
+
+
 def test_targets_carry_no_gradient():
     def through_target(x):
         target = losses.td_target(x, x, x)
