@@ -38,7 +38,18 @@ EXPERIMENTS = {
     "cmrl-holdout-drawer-close": (
         f"{CMRL} --tasks.train drawer-open,window-open,window-close --tasks.test drawer-close"
     ),
+    "cmrl-holdout-drawer-open": (
+        f"{CMRL} --tasks.train drawer-close,window-open,window-close --tasks.test drawer-open"
+    ),
+    "cmrl-holdout-window-open": (
+        f"{CMRL} --tasks.train drawer-open,drawer-close,window-close --tasks.test window-open"
+    ),
+    "cmrl-canonical-seed0": f"{CMRL} --env.obs_mode canonical",
+    "cmrl-canonical-seed1": f"{CMRL} --env.obs_mode canonical --seed 1",
     "cmrl-paper": f"--config cmrl-paper.yaml {BUDGET}",
+    "cmrl-white-noise": (
+        f"{CMRL} --collect.noise_correlation 0 --collect.noise_scale 1 --sac.target_entropy -1"
+    ),
     "cmrl-no-return-norm": f"{CMRL} --sac.reward_norm none",
     "cmrl-shared-alpha": f"{CMRL} --sac.alpha shared",
     "cmrl-no-router": f"{CMRL} --model.net mlp",

@@ -1,0 +1,93 @@
+"""Is z used, are the words? Every control of `eval` on finished runs: `python scripts/controls.py
+NAME ...`, runs of scripts/experiments.py.
+
+Each control is one `python train.py eval` (`--list` prints them) and one JSON in
+results/NAME/controls. What is there already is not run again; a policy that reads no text has no
+text controls. `table` is the Markdown that scripts/figures.py prints of them.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT)]
+
+from cmrl_jax.config import Config  # noqa: E402
+from cmrl_jax.config_io import read_yaml, resolve  # noqa: E402
+from scripts.experiments import RESULTS, RUNS  # noqa: E402
+
+CONTROLS = {
+    "posterior": "",  # the protocol itself
+    "z-prior": "--z prior",
+    "z-shuffled": "--z shuffled",
+    "z-other": "--z other",
+    "z-text": "--z text",
+    "text-shuffled": "--text-control shuffled",
+    "text-zero": "--text-control zero",
+    "text-heldout": "--paraphrases heldout",
+}
+K = "0,1,2,5,10"
+
+
+def applies(control: str, config: Config) -> bool:
+    """Whether a policy has what the control takes away."""
+    if config.model.conditioning != "z":
+        return control == "posterior"
+    fusion = config.encoder.goal_fusion
+    if control == "z-text":
+        return fusion in ("factor", "both")
+    return not control.startswith("text-") or fusion != "none"
+
+
+def command(name: str, control: str) -> list[str]:
+    run, kept = RUNS / name, RESULTS / name / "controls" / f"{control}.json"
+    words = ["train.py", "eval", "--run", str(run), "--k", K, *shlex.split(CONTROLS[control])]
+    return [*words, "--json", str(kept)]
+
+
+def table(run: Path) -> list[str]:
+    """Success at any step of every control, a row a control and a column a task; k side by side."""
+    kept = {name: run / "controls" / f"{name}.json" for name in CONTROLS}
+    found = {
+        name: json.loads(path.read_text(encoding="utf-8"))["tasks"]
+        for name, path in kept.items()
+        if path.is_file()
+    }
+    tasks = list(found["posterior"])
+    head = [f"{run.name}, k = {K.replace(',', ', ')}", *tasks]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    for name, by_task in found.items():
+        cells = []
+        for task in tasks:
+            figures = [by_task[task].get(k) for k in K.split(",")]
+            cells.append(" ".join(f"{f['success_any']:.2f}" if f else "-" for f in figures))
+        lines.append("| " + " | ".join([name, *cells]) + " |")
+    return lines
+
+
+def main(words: list[str]) -> int:
+    if "--list" in words:
+        for control in CONTROLS:
+            print(f"python {shlex.join(command('NAME', control))}")
+        return 0
+    for name in words:
+        config = resolve(*read_yaml(ROOT / RUNS / name / "config.yaml"))
+        for control in CONTROLS:
+            kept = ROOT / RESULTS / name / "controls" / f"{control}.json"
+            if kept.exists() or not applies(control, config):
+                continue
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            print(f"== {name} {control}", flush=True)
+            code = subprocess.run([sys.executable, *command(name, control)], cwd=ROOT).returncode
+            if code:
+                return code
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
