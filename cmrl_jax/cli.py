@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from cmrl_jax import evaluate_flags, finetune_flags, render_flags
+from cmrl_jax import evaluate_flags, finetune_flags, plot_flags, render_flags
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
 from cmrl_jax.config_io import (
     check_resumable,
@@ -146,31 +146,25 @@ def _check_extras(config: Config) -> None:
         raise ConfigError(cause, "pip install 'cmrl-jax[viz]', or set log.tensorboard: false")
 
 
-def plot_parser() -> argparse.ArgumentParser:
-    """Flags of `plot`."""
-    parser = Parser(
-        prog="python train.py plot",
-        description="Draws success, returns and adaptation of runs; seeds of one run as a band.",
-        allow_abbrev=False,
-    )
-    parser.add_argument(
-        "--run",
-        metavar="DIR",
-        type=Path,
-        required=True,
-        action="append",
-        help="run directory, again for more runs; DIR-seed0, DIR-seed1 are one band",
-    )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="directory [plots/ of the first]")
-    return parser
-
-
 def _plot(words: list[str]) -> int:
-    args = parse(plot_parser(), words)
+    parser = Parser(
+        prog="python train.py plot", description=plot_flags.DESCRIPTION, allow_abbrev=False
+    )
+    args = parse(plot_flags.add_flags(parser), words)
+    inspected, out = args.run if args.inspect else (), args.out or args.run[0] / "plots"
+    for run in inspected:
+        plot_flags.check_inspectable(run)
 
     from cmrl_jax import plots
 
-    for picture in plots.plot_all(args.run, args.out or args.run[0] / "plots"):
+    for picture in plots.plot_learning(args.run, out):
+        print(picture, flush=True)
+    if inspected:
+        from cmrl_jax import inspection  # jax, which no figure needs
+
+        for run in inspected:
+            print(inspection.inspect_run(run) or f"{run} has neither z nor modules to inspect")
+    for picture in plots.plot_inspections(args.run, out):
         print(picture)
     return 0
 

@@ -12,7 +12,7 @@ evaluation of a process runs one compiled program, controls included.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -110,31 +110,43 @@ class Evaluator:
     def run(
         self, policies: Sequence[PolicyParams], trial: Trial, k: Sequence[int], seed: int
     ) -> dict[int, Episode]:
-        """Scores at every k of `k`.
+        """Scores at every k of `k`; arguments as of `episodes`.
+
+        Returns:
+            k -> Episode of numpy arrays (policy, task, goal, draw).
+        """
+        played = enumerate(self.episodes(policies, trial, max(k) + 1, seed))
+        scores = {episode: score for episode, (_, score) in played if episode in k}
+        return {n: scores[n] for n in k}
+
+    def episodes(
+        self, policies: Sequence[PolicyParams], trial: Trial, count: int, seed: int
+    ) -> Iterator[tuple[Any, Episode]]:
+        """Plays `count` episodes of every adaptation run, each from what those before it showed.
 
         Args:
             policies: at most as many as the evaluator has place for.
             seed: seed of the draws; a draw depends on it, task, goal, draw and episode alone.
 
-        Returns:
-            k -> Episode of numpy arrays (policy, task, goal, draw).
+        Yields:
+            For each episode the beliefs of all lanes before it, numpy (policy, lane, ...) or None
+            without a latent, and its Episode of numpy arrays (policy, task, goal, draw).
         """
         self.compile(policies[0], trial.texts.shape[-1])
         params = _stack([*policies, *[policies[-1]] * (self.policies - len(policies))])
-        tasks, goals = trial.placements.shape[:2]
-        lanes, texts = self._lanes(trial), self._texts(trial)
-        count = len(lanes.lane_id)
+        shape = (len(policies), *trial.placements.shape[:2], trial.draws)
+        lanes, texts = self.lanes_of(trial), self.texts_of(trial)
+        total = len(lanes.lane_id)
         donor = donors(trial.z, lanes.lane_id, lanes.env_task)
         uses_belief = trial.z not in ("prior", "text")
         text_mask = np.full((self.policies, self.lanes), trial.z != "prior", np.float32)
-        key, beliefs = jax.random.key(seed), self._empty(count)
-        scores: dict[int, Episode] = {}
-        for episode in range(max(k) + 1):
+        key, beliefs = jax.random.key(seed), self._empty(total)
+        for episode in range(count):
             # Every batch draws from what was known before the episode, its donors' lanes too.
             before = jax.tree.map(np.copy, beliefs)
             parts = []
-            for start in range(0, count, self.lanes):
-                index = np.minimum(np.arange(start, start + self.lanes), count - 1)
+            for start in range(0, total, self.lanes):
+                index = np.minimum(np.arange(start, start + self.lanes), total - 1)
                 giver = donor[index]
                 belief = jax.tree.map(lambda x: x[:, giver], before) if uses_belief else None
                 belief, part = self._compiled(
@@ -146,15 +158,13 @@ class Evaluator:
                     np.bool_(trial.deterministic),
                     jax.random.fold_in(key, episode),
                 )
-                valid = min(self.lanes, count - start)
+                valid = min(self.lanes, total - start)
                 for all_lanes, new in zip(*map(jax.tree.leaves, (beliefs, belief)), strict=True):
                     all_lanes[:, start : start + valid] = np.asarray(new)[:, :valid]
                 parts.append(jax.tree.map(np.asarray, part))
-            if episode in k:
-                joined = jax.tree.map(lambda *x: np.concatenate(x, 1)[:, :count], *parts)
-                shape = (len(policies), tasks, goals, trial.draws)
-                scores[episode] = jax.tree.map(lambda x: x[: shape[0]].reshape(shape), joined)
-        return {n: scores[n] for n in k}
+            joined = jax.tree.map(lambda *x: np.concatenate(x, 1)[:, :total], *parts)
+            known = jax.tree.map(lambda x: x[: shape[0]], before)
+            yield known, jax.tree.map(lambda x: x[: shape[0]].reshape(shape), joined)
 
     def _empty(self, lanes: int) -> Any:
         """Empty beliefs of all policies, numpy (policy, lane, ...); None without a latent."""
@@ -163,7 +173,8 @@ class Evaluator:
         belief = init_belief((self.policies, lanes), self._inference.latent_dim)
         return jax.tree.map(np.array, belief)
 
-    def _lanes(self, trial: Trial) -> Lanes:
+    def lanes_of(self, trial: Trial) -> Lanes:
+        """All lanes of a trial, in the order task, goal, draw."""
         task, goal, _ = _indices(trial)
         train = self._train_tasks
         rows = [train.index(name) if name in train else 0 for name in trial.tasks]
@@ -174,7 +185,7 @@ class Evaluator:
             placement=np.asarray(trial.placements, np.float32)[task, goal],
         )
 
-    def _texts(self, trial: Trial) -> np.ndarray:
+    def texts_of(self, trial: Trial) -> np.ndarray:
         """The text of every lane (policy, lane, G), for all places of the evaluator."""
         texts = np.repeat(np.asarray(trial.texts, np.float32), trial.draws, axis=2)
         texts = texts.reshape(len(texts), -1, texts.shape[-1])

@@ -9,6 +9,7 @@ import numpy as np
 from cmrl_jax.config import ConfigError
 from cmrl_jax.goal_builder import all_vectors, task_cosines
 from cmrl_jax.goals import GoalTable
+from cmrl_jax.pca import principal_axes
 
 
 def draw(table: GoalTable, out: Path) -> None:
@@ -45,8 +46,8 @@ def draw(table: GoalTable, out: Path) -> None:
     left.set_title(f"cosines of {count} sentences a task; numbers: mean over pairs")
     figure.colorbar(image, ax=left, shrink=0.85)
 
-    points, shares = pca(flat)
-    points = points.reshape(tasks, count, 2)
+    centre, axes, shares = principal_axes(flat)
+    points = ((flat - centre) @ axes.T).reshape(tasks, count, 2)
     trained = table.vectors.shape[1]
     for index, task in enumerate(table.tasks):
         color = f"C{index}"
@@ -66,10 +67,3 @@ def draw(table: GoalTable, out: Path) -> None:
         ) from error
     finally:
         pyplot.close(figure)
-
-
-def pca(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first two principal components (row, 2) and their shares of the variance (2,)."""
-    centred = rows - rows.mean(0)
-    left, values, _ = np.linalg.svd(centred, full_matrices=False)
-    return left[:, :2] * values[:2], values[:2] ** 2 / (values**2).sum()

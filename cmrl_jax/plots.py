@@ -1,17 +1,20 @@
 """`train.py plot`: figures of one or more runs. matplotlib is an extra (`viz`).
 
 From metrics.csv: success and return over env steps. From eval.json: the paper's bars and success
-by adaptation episodes. From the last policy checkpoint (`inspection.py`): routing and latents.
+by adaptation episodes. From inspection.json, which `--inspect` takes from the last policy
+checkpoint (inspection.py): routing and latents.
 Runs whose directories differ in `-seed<N>` alone are one group: its mean, and a band from the
 lowest to the highest.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,8 @@ import numpy as np
 
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.inspection_figures import plot_latents, plot_routing
+from cmrl_jax.inspection_file import read_inspection
 
 Series = list[tuple[float, float]]
 
@@ -214,15 +219,27 @@ def plot_k_shot(runs: Runs, out: Path) -> Path:
     return _finish(pyplot, figure, list(panels.values()), out)
 
 
-def plot_all(runs: Sequence[Path], out: Path) -> list[Path]:
-    """Every figure that the runs' files allow, as PNG in the directory `out`.
+@contextlib.contextmanager
+def _pictures(pyplot: Any, out: Path) -> Iterator[None]:
+    """Makes the directory that pictures go to, and reports one that refuses them."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        cause = f"cannot write to {out}: {error.strerror}"
+        raise ConfigError(cause, "give --out a directory you may write to") from error
+    finally:
+        pyplot.close("all")
+
+
+def plot_learning(runs: Sequence[Path], out: Path) -> list[Path]:
+    """Every figure that the runs' metrics and evaluations allow, as PNG in the directory `out`.
 
     Raises:
         ConfigError: matplotlib is missing, a run has no figures, or `out` cannot be written.
     """
     pyplot, loaded = _pyplot(), Runs(runs)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
+    with _pictures(pyplot, out):
         drawn = [
             plot_success(loaded, out / "success.png"),
             plot_returns(loaded, out / "returns.png"),
@@ -230,11 +247,34 @@ def plot_all(runs: Sequence[Path], out: Path) -> list[Path]:
         if any(loaded.final(group, task) for group in loaded.groups for task in loaded.tasks):
             drawn.append(plot_bars(loaded, out / "bars.png"))
             drawn.append(plot_k_shot(loaded, out / "k_shot.png"))
-    except OSError as error:
-        cause = f"cannot write to {out}: {error.strerror}"
-        raise ConfigError(cause, "give --out a directory you may write to") from error
-    finally:
-        pyplot.close("all")
+    return drawn
+
+
+def plot_inspections(runs: Sequence[Path], out: Path) -> list[Path]:
+    """routing.png and z.png of the runs that were inspected, in the directory `out`.
+
+    A line on standard error for each of the two that an inspected run has nothing to show in.
+
+    Raises:
+        ConfigError: matplotlib is missing, an inspection.json cannot be read, or `out` written.
+    """
+    pyplot, drawn = _pyplot(), []
+    read = [(run.resolve().name, read_inspection(run)) for run in runs]
+    found = [(name, inspection) for name, inspection in read if inspection is not None]
+    figures = (
+        ("routing.png", plot_routing, "modules to route to", lambda x: x.routing),
+        ("z.png", plot_latents, "latent z", lambda x: x.latents),
+    )
+    with _pictures(pyplot, out):
+        for file, plot, part, part_of in figures:
+            shown = []
+            for name, inspection in found:
+                if part_of(inspection) is not None:
+                    shown.append((name, inspection))
+                else:
+                    print(f"{name} is not in {file}: its policy has no {part}", file=sys.stderr)
+            if shown:
+                drawn.append(plot(pyplot, shown, out / file))
     return drawn
 
 

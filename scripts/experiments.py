@@ -2,7 +2,8 @@
 
 A run that is finished is left alone, one that was stopped is resumed, so this command can be
 stopped (Ctrl-C, SIGTERM) and given again at any time. Runs go to runs/experiments/NAME; what
-results/ keeps of each (config, versions, thinned metrics, evaluation) is copied to results/NAME.
+results/ keeps of each (config, versions, thinned metrics, evaluation, inspection) is copied to
+results/NAME.
 `--list` prints the commands. All runs have one budget, BUDGET, but for the single-task ones, the
 multi-task ceiling and those that ask whether words matter.
 """
@@ -81,6 +82,8 @@ def keep(name: str) -> None:
     kept.mkdir(parents=True, exist_ok=True)
     for file in ("config.yaml", "versions.json", "eval.json"):
         shutil.copy(run / file, kept / file)
+    if (run / "inspection.json").is_file():  # of `train.py plot --inspect`
+        shutil.copy(run / "inspection.json", kept / "inspection.json")
     with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
         header, *rows = csv.reader(file)
     evaluated = [i for i, column in enumerate(header) if column.startswith("eval/")]

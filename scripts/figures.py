@@ -1,7 +1,8 @@
 """Every figure and table of results/ again, from the files kept there: `python scripts/figures.py`.
 
-Figures go to results/figures; the table of final evaluations, as Markdown, to standard output.
-Runs that are not there yet are left out, and figures with fewer than two runs.
+Figures of several runs go to results/figures, routing and z of each that has an inspection.json to
+its own folder; the table of final evaluations, as Markdown, to standard output. Runs that are not
+there yet are left out, and figures of several runs with fewer than two.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from cmrl_jax.config import TASKS  # noqa: E402
-from cmrl_jax.plots import plot_all  # noqa: E402
+from cmrl_jax.inspection_file import FILE as INSPECTION  # noqa: E402
+from cmrl_jax.plots import plot_inspections, plot_learning  # noqa: E402
 
 RESULTS = ROOT / "results"
 # Directory under results/figures -> runs under results/, whichever of them are there.
@@ -59,11 +61,15 @@ def table(runs: list[Path]) -> list[str]:
 
 def main() -> int:
     kept = lambda name: (RESULTS / name / "eval.json").is_file()
+    drawn = []
     for folder, names in FIGURES.items():
         runs = [RESULTS / name for name in names if kept(name)]
         if len(runs) > 1:
-            for path in plot_all(runs, RESULTS / "figures" / folder):
-                print(path.relative_to(ROOT), file=sys.stderr)
+            drawn += plot_learning(runs, RESULTS / "figures" / folder)
+    for file in sorted(RESULTS.glob(f"*/{INSPECTION}")):
+        drawn += plot_inspections([file.parent], file.parent)
+    for path in drawn:
+        print(path.relative_to(ROOT), file=sys.stderr)
     listed = dict.fromkeys(name for names in FIGURES.values() for name in names)
     print("\n".join(table([RESULTS / name for name in listed if kept(name)])))
     return 0

@@ -12,7 +12,6 @@ from cmrl_jax import goal_builder, minilm
 from cmrl_jax.cli import main
 from cmrl_jax.config import TASKS, ConfigError
 from cmrl_jax.encoders import embed, file_sha256
-from cmrl_jax.goal_figure import pca
 from cmrl_jax.goal_files import table_path
 from cmrl_jax.goals import load_goals, read_table
 
@@ -218,15 +217,3 @@ def test_figure_is_a_picture(tmp_path, refused):
     assert "cannot write" in cause and ".png" in cure
     assert main(["goals", "--figure", str(tmp_path / "new" / "f.png")]) == 0
     assert (tmp_path / "new" / "f.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_pca_finds_the_plane_that_the_points_lie_in():
-    rng = np.random.default_rng(0)
-    plane = np.linalg.qr(rng.normal(size=(6, 2)))[0]
-    flat = rng.normal(size=(40, 2)) * [3.0, 0.5]
-    flat -= flat.mean(0)
-    points, shares = pca(flat @ plane.T + 7.0)
-    assert shares.sum() == pytest.approx(1)
-    variances = np.linalg.eigvalsh(np.cov(flat.T))[::-1]
-    np.testing.assert_allclose(points.var(0, ddof=1), variances)
-    np.testing.assert_allclose(points @ points.T, flat @ flat.T, atol=1e-9)  # distances are kept

@@ -1,0 +1,44 @@
+"""Flags of `train.py plot`, and the check of `--inspect`, before jax is imported."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from cmrl_jax.config import ConfigError
+from cmrl_jax.run_dir import find_run
+
+DESCRIPTION = (
+    "Draws success, returns, adaptation, routing and latents of runs; seeds of one run as a band."
+)
+
+
+def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Adds the flags of `plot`."""
+    parser.add_argument(
+        "--run",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        action="append",
+        help="run directory, again for more runs; DIR-seed0, DIR-seed1 are one band",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="directory [plots/ of the first]")
+    parser.add_argument(
+        "--inspect",
+        action="store_true",
+        help="first roll out each run's policy and write DIR/inspection.json, for routing and z",
+    )
+    return parser
+
+
+def check_inspectable(run: Path) -> None:
+    """Whether `--inspect` finds a policy in a run.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if not (find_run(run) / "policy").is_dir():
+        cause = f"--inspect needs a policy checkpoint, and {run / 'policy'} does not exist"
+        cure = "leave --inspect out: an inspection.json that is there is drawn without it"
+        raise ConfigError(cause, cure)
