@@ -30,6 +30,8 @@ WORDS = "--config ml4.yaml --env.physics native --train.env_steps 600000 --kl.be
 EXPERIMENTS = {
     "cmrl-seed0": CMRL,
     "cmrl-seed1": f"{CMRL} --seed 1",
+    "grounded-seed0": f"--config ml4-grounded.yaml {BUDGET}",
+    "grounded-seed1": f"--config ml4-grounded.yaml {BUDGET} --seed 1",
     "mtsac": "--config mtsac.yaml --env.physics native --train.env_steps 960000",
     "pearl": f"--config pearl.yaml {BUDGET}",
     "sac-drawer-close": f"{SINGLE} --tasks.train drawer-close",
