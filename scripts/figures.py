@@ -1,8 +1,8 @@
 """Every figure and table of results/ again, from the files kept there: `python scripts/figures.py`.
 
 Figures of several runs go to results/figures, routing and z of each that has an inspection.json to
-its own folder; the table of final evaluations, as Markdown, to standard output. Runs that are not
-there yet are left out, and figures of several runs with fewer than two.
+its own folder; the tables, as Markdown, to standard output. Runs that are not there yet are left
+out, and figures of several runs with fewer than two.
 """
 
 from __future__ import annotations
@@ -16,34 +16,56 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from cmrl_jax.config import TASKS  # noqa: E402
+from cmrl_jax.config_io import read_yaml, resolve  # noqa: E402
 from cmrl_jax.inspection_file import FILE as INSPECTION  # noqa: E402
-from cmrl_jax.plots import plot_inspections, plot_learning  # noqa: E402
+from cmrl_jax.plots import plot_adaptation, plot_inspections, plot_learning  # noqa: E402
+from scripts import controls  # noqa: E402
 
 RESULTS = ROOT / "results"
-# Directory under results/figures -> runs under results/, whichever of them are there.
-FIGURES = {
-    "baselines": ("cmrl-seed0", "cmrl-seed1", "pearl", "cmrl-paper", "mtsac"),
+# Table, and directory under results/figures -> runs under results/, whichever of them are there.
+GROUPS = {
     "cmrl-pearl": ("cmrl-seed0", "cmrl-seed1", "pearl"),  # the paper's Figures 4 and 5
+    "baselines": (
+        "cmrl-seed0",
+        "cmrl-seed1",
+        "grounded-seed0",
+        "grounded-seed1",
+        "pearl",
+        "cmrl-paper",
+        "mtsac",
+    ),
     "single-task": ("sac-drawer-open", "sac-drawer-close", "sac-window-open", "sac-window-close"),
+    "held-out": (
+        "cmrl-seed0",
+        "cmrl-seed1",
+        "cmrl-holdout-drawer-close",
+        "cmrl-holdout-drawer-open",
+        "cmrl-holdout-window-open",
+        "cmrl-canonical-seed0",
+        "cmrl-canonical-seed1",
+    ),
     "ablations": (
         "cmrl-seed0",
+        "cmrl-seed1",
+        "cmrl-white-noise",
         "cmrl-no-return-norm",
         "cmrl-shared-alpha",
         "cmrl-no-router",
         "cmrl-no-goal",
-        "cmrl-white-noise",
     ),
+    "words": ("words-kl", "words-canonical", "words-recon", "words-contrastive", "words-all"),
 }
 
 
 def table(runs: list[Path]) -> list[str]:
     """Success at any / last step of the final evaluations at the largest k, a row a run."""
-    head = ["run", "env steps", "gradient steps", "wall minutes", "k", *TASKS]
+    head = ["run", "env steps", "gradient steps", "wall minutes", "steps to 0.9", "k", *TASKS]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for run in runs:
         result = json.loads((run / "eval.json").read_text(encoding="utf-8"))
+        config = resolve(*read_yaml(run / "config.yaml"))
         with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
-            last = list(csv.DictReader(file))[-1]
+            rows = list(csv.DictReader(file))
         cells, k = [], ""
         for task in TASKS:
             by_k = result["tasks"].get(task)
@@ -52,26 +74,53 @@ def table(runs: list[Path]) -> list[str]:
                 continue
             k = max(by_k, key=int)
             figures = by_k[k]
-            cells.append(f"{figures['success_any']:.2f} / {figures['success_last']:.2f}")
-        wall = f"{float(last['wall_s']) / 60:.1f}"
-        counts = [f"{int(last[name]):,}" for name in ("env_steps", "gradient_steps")]
-        lines.append("| " + " | ".join([run.name, *counts, wall, k, *cells]) + " |")
+            held_out = " (held out)" if task in config.tasks.test else ""
+            cells.append(f"{figures['success_any']:.2f} / {figures['success_last']:.2f}{held_out}")
+        wall = f"{float(rows[-1]['wall_s']) / 60:.1f}"
+        counts = [f"{int(rows[-1][name]):,}" for name in ("env_steps", "gradient_steps")]
+        solved = steps_to_solve(rows, config.tasks.train, max(config.eval.k))
+        lines.append("| " + " | ".join([run.name, *counts, wall, solved, k, *cells]) + " |")
     return lines
 
 
+def steps_to_solve(rows: list[dict[str, str]], tasks: tuple[str, ...], k: int) -> str:
+    """Env steps at the first evaluation where each of `tasks` succeeds on 0.9 of its goals."""
+    for row in rows:
+        scores = [row[f"eval/{task}/k{k}/success_any"] for task in tasks]
+        if all(scores) and min(map(float, scores)) >= 0.9:
+            return f"{int(row['env_steps']):,}"
+    return "-"
+
+
+def adaptation_figure() -> Path | None:
+    """The curves of every results/finetune/RUN.json in one figure."""
+    curves, task = {}, ""
+    for file in sorted((RESULTS / "finetune").glob("*.json")):
+        result = json.loads(file.read_text(encoding="utf-8"))
+        task = result["task"]
+        named = {name if name == "scratch" else f"{file.stem}, {name}": curve
+                 for name, curve in result["curves"].items()}  # fmt: skip
+        curves |= named
+    return plot_adaptation(curves, task, RESULTS / "finetune" / "curves.png") if curves else None
+
+
 def main() -> int:
-    kept = lambda name: (RESULTS / name / "eval.json").is_file()
+    kept = lambda names: [
+        RESULTS / name for name in names if (RESULTS / name / "eval.json").is_file()
+    ]
     drawn = []
-    for folder, names in FIGURES.items():
-        runs = [RESULTS / name for name in names if kept(name)]
-        if len(runs) > 1:
-            drawn += plot_learning(runs, RESULTS / "figures" / folder)
+    for folder, names in GROUPS.items():
+        if len(kept(names)) > 1:
+            drawn += plot_learning(kept(names), RESULTS / "figures" / folder)
     for file in sorted(RESULTS.glob(f"*/{INSPECTION}")):
         drawn += plot_inspections([file.parent], file.parent)
+    drawn += [path for path in [adaptation_figure()] if path]
     for path in drawn:
         print(path.relative_to(ROOT), file=sys.stderr)
-    listed = dict.fromkeys(name for names in FIGURES.values() for name in names)
-    print("\n".join(table([RESULTS / name for name in listed if kept(name)])))
+    for group, names in GROUPS.items():
+        print(f"\n{group}\n", *table(kept(names)), sep="\n")
+    for file in sorted(RESULTS.glob("*/controls/posterior.json")):
+        print("", *controls.table(file.parent.parent), sep="\n")
     return 0
 
 

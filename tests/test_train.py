@@ -174,7 +174,7 @@ def test_evaluation_does_not_depend_on_what_was_evaluated_before_or_beside(finis
     np.testing.assert_allclose(alone[1].returns[:, :, 0], first[1].returns[:, :, 0], rtol=1e-4)
 
 
-PRESETS = ("ml4", "pearl", "cmrl-paper", "mtsac", "sac", "ml4-large")
+PRESETS = ("ml4", "ml4-grounded", "pearl", "cmrl-paper", "mtsac", "sac", "ml4-large")
 
 
 @pytest.mark.parametrize("preset", PRESETS)
