@@ -126,9 +126,11 @@ def _finish(pyplot: Any, figure: Any, axes: Sequence[Any], out: Path) -> Path:
     for axis in axes:
         handles, labels = axis.get_legend_handles_labels()
         labelled |= dict(zip(labels, handles, strict=True))
-    figure.tight_layout(rect=(0, 0.09, 1, 1))
-    figure.legend(labelled.values(), labelled.keys(), loc="lower center", ncols=5, fontsize=8)
-    figure.savefig(out, dpi=110)
+    figure.tight_layout()
+    columns = max(1, int(figure.get_figwidth() / 2.8))  # inches a label may take
+    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0)}
+    figure.legend(labelled.values(), labelled.keys(), ncols=columns, fontsize=8, **place)
+    figure.savefig(out, dpi=110, bbox_inches="tight")
     pyplot.close(figure)
     return out
 
