@@ -114,8 +114,8 @@ class EncoderConfig:
     information_bottleneck: bool = doc(True, "false: z is the mean of the factors, no KL")
     aux: Literal["none", "recon", "contrastive"] = doc(
         "none",
-        "z also learns recon: to predict reward and change of the observation; contrastive: which "
-        "task's experience and which task's text belong together",
+        "z also learns recon: to predict reward and change of the observation over n_step steps; "
+        "contrastive: which task's experience and which task's text belong together",
     )
     aux_weight: float = doc(0.1, "weight of the auxiliary loss")
     z_resample: Literal["episode", "step"] = doc("episode", "when z is redrawn in a rollout")

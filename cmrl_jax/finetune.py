@@ -75,6 +75,8 @@ def finetune_config(
         scale = config.sac.reward_scale / denominator
         sac = replace(config.sac, reward_norm="none", reward_scale=scale, task_rows=0)
     encoder = config.encoder
+    if encoder.aux == "contrastive":
+        encoder = replace(encoder, aux="none")  # one task alone has nothing to be told from
     if adapt == "z":
         # The latent stands alone: no encoder, and no decoder that its parameters would hold.
         encoder = replace(encoder, information_bottleneck=False, aux="none")

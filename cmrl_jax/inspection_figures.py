@@ -169,10 +169,11 @@ def _latent_panel(axis: Any, inspection: Inspection) -> None:
     axis.plot([], [], "o", ms=6, mec="k", mew=0.5, label=f"posterior's mean, k = {k}", **gray)
     if latents.text_mean is not None:
         axis.plot([], [], "D", ms=8, mfc="none", label="text alone, k = 0", **gray)
-    angle = np.linspace(0, 2 * np.pi, 200)
-    origin = project(np.zeros(len(centre)))
-    circle = origin + CIRCLE * np.stack([np.cos(angle), np.sin(angle)], 1)
-    axis.plot(*circle.T, color="0.4", lw=1, ls="--", label="95 % of N(0, I)")
+    if latents.kl is not None:  # without information bottleneck no prior is in force
+        angle = np.linspace(0, 2 * np.pi, 200)
+        origin = project(np.zeros(len(centre)))
+        circle = origin + CIRCLE * np.stack([np.cos(angle), np.sin(angle)], 1)
+        axis.plot(*circle.T, color="0.4", lw=1, ls="--", label="95 % of N(0, I)")
 
     low, high = np.array([axis.dataLim.min, axis.dataLim.max])
     middle, half = (low + high) / 2, 0.55 * (high - low).max()
@@ -185,7 +186,7 @@ def _latent_panel(axis: Any, inspection: Inspection) -> None:
     axis.text(
         0.5, 1.015, verdict(latents), transform=axis.transAxes, ha="center", va="bottom", fontsize=9
     )
-    nats = "nats of the posterior over N(0, I)"
+    nats = "" if latents.kl is None else "nats of the posterior over N(0, I)"
     axis.legend(
         title=nats + (" (of the text alone)" if latents.text_kl is not None else ""),
         title_fontsize=8,

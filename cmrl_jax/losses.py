@@ -146,14 +146,16 @@ def kl_loss(
 
 
 def reconstruction_loss(predicted: jax.Array, reward: jax.Array, change: jax.Array) -> jax.Array:
-    """Squared error of predicted rewards and changes of the observation (algorithm section 4.8).
+    """Squared error of predicted rewards and changes of the observation.
 
+    Both over the n steps of the Bellman target (`sac.n_step`), from its first action.
     Targets are standardised over the minibatch, dimension by dimension, so that a loss of 1 is
     what a constant prediction gets; the reward counts as much as all of the observation.
 
     Args:
         predicted: (task, batch, 1 + obs), the reward first.
-        reward: (task, batch); change: next observation minus observation, (task, batch, obs).
+        reward: n-step sum, (task, batch); change: observation n steps later minus observation,
+            (task, batch, obs).
 
     Returns:
         (task,)

@@ -130,7 +130,7 @@ class SoftModularNet(nn.Module):
 class ContextEncoder(nn.Module):
     """One Gaussian factor a transition, and one of the goal text (algorithm sections 2.1 - 2.3).
 
-    With `encoder.aux: recon` also the decoder that z is trained through (section 4.8).
+    With `encoder.aux: recon` also the decoder that z is trained through.
     """
 
     hidden: tuple[int, ...]
@@ -188,7 +188,7 @@ class ContextEncoder(nn.Module):
         return split_factor(self.goal_net(projected)[0])
 
     def reconstruct(self, x: jax.Array, zc: jax.Array) -> jax.Array:
-        """[obs, action] (..., feature) and z -> reward and change of obs, (..., 1 + obs)."""
+        """[obs, action] (..., feature) and z -> n-step reward and change of obs, (..., 1 + obs)."""
         return self.decoder(x, zc)[0]
 
 
@@ -214,7 +214,7 @@ class Networks:
         transition_factors: (params, features, goal, goal_mask) -> Gaussian (..., context, latent).
         goal_factor: (params, goal) -> Gaussian (..., latent); None without a goal factor.
         reconstruct: (encoder_params, obs, action, zc) -> predicted reward and change of the
-            observation, (..., 1 + obs); None without `encoder.aux`.
+            observation over `sac.n_step` steps, (..., 1 + obs); None unless `encoder.aux` is recon.
     """
 
     conditioning_size: int

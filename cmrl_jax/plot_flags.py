@@ -40,5 +40,5 @@ def check_inspectable(run: Path) -> None:
     """
     if not (find_run(run) / "policy").is_dir():
         cause = f"--inspect needs a policy checkpoint, and {run / 'policy'} does not exist"
-        cure = "leave --inspect out: an inspection.json that is there is drawn without it"
+        cure = "let the run reach a policy checkpoint (checkpoint.policy_every), or leave it out"
         raise ConfigError(cause, cure)

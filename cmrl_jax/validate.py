@@ -99,6 +99,12 @@ def _check_model(config: Config) -> None:
         )
         cause = "model.net soft with neither modular_actor nor modular_critic"
         _require(model.modular_actor or model.modular_critic, cause, "set model.net: mlp")
+    alone = encoder.aux == "contrastive" and len(config.tasks.train) < 2
+    cause = "encoder.aux contrastive with one training task: nothing to tell it from"
+    _require(not alone, cause, "name a second task in tasks.train, or set encoder.aux: none")
+    cause = f"encoder.aux {encoder.aux} with model.conditioning {model.conditioning}: no z to train"
+    cure = "set encoder.aux: none, or model.conditioning: z"
+    _require(encoder.aux == "none" or model.conditioning == "z", cause, cure)
     _require(bool(model.mlp_hidden), "model.mlp_hidden is empty", "give at least one width")
     _require(bool(encoder.hidden), "encoder.hidden is empty", "give at least one width")
     cause = f"sac.variant v with model.critic {model.critic}"

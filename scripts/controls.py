@@ -3,7 +3,7 @@ NAME ...`, runs of scripts/experiments.py.
 
 Each control is one `python train.py eval` (`--list` prints them) and one JSON in
 results/NAME/controls. What is there already is not run again; a policy that reads no text has no
-text controls. `table` is the Markdown that scripts/figures.py prints of them.
+text controls, one without z none at all. `table` is the Markdown of scripts/figures.py.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ K = "0,1,2,5,10"
 def applies(control: str, config: Config) -> bool:
     """Whether a policy has what the control takes away."""
     if config.model.conditioning != "z":
-        return control == "posterior"
+        return False
     fusion = config.encoder.goal_fusion
     if control == "z-text":
         return fusion in ("factor", "both")
@@ -64,7 +64,7 @@ def table(run: Path) -> list[str]:
     for name, by_task in found.items():
         cells = []
         for task in tasks:
-            figures = [by_task[task].get(k) for k in K.split(",")]
+            figures = [by_task.get(task, {}).get(k) for k in K.split(",")]
             cells.append(" ".join(f"{f['success_any']:.2f}" if f else "-" for f in figures))
         lines.append("| " + " | ".join([name, *cells]) + " |")
     return lines
@@ -75,6 +75,12 @@ def main(words: list[str]) -> int:
         for control in CONTROLS:
             print(f"python {shlex.join(command('NAME', control))}")
         return 0
+    finished = sorted(path.parent.name for path in (ROOT / RUNS).glob("*/eval.json"))
+    unknown = [name for name in words if name not in finished]
+    if unknown or not words:
+        cause = f"no finished run {unknown[0]} in {RUNS}" if unknown else "no run is named"
+        print(f"error: {cause}\nfix: choose from {', '.join(finished) or 'none yet'}")
+        return 2
     for name in words:
         config = resolve(*read_yaml(ROOT / RUNS / name / "config.yaml"))
         for control in CONTROLS:

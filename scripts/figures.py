@@ -86,22 +86,21 @@ def table(runs: list[Path]) -> list[str]:
 def steps_to_solve(rows: list[dict[str, str]], tasks: tuple[str, ...], k: int) -> str:
     """Env steps at the first evaluation where each of `tasks` succeeds on 0.9 of its goals."""
     for row in rows:
-        scores = [row[f"eval/{task}/k{k}/success_any"] for task in tasks]
-        if all(scores) and min(map(float, scores)) >= 0.9:
+        scores = [row.get(f"eval/{task}/k{k}/success_any") for task in tasks]
+        if all(scores) and min(float(score or 0) for score in scores) >= 0.9:
             return f"{int(row['env_steps']):,}"
     return "-"
 
 
-def adaptation_figure() -> Path | None:
-    """The curves of every results/finetune/RUN.json in one figure."""
-    curves, task = {}, ""
+def adaptation_figures() -> list[Path]:
+    """The curves of every results/finetune/RUN.json, a figure a task."""
+    curves: dict[str, dict] = {}
     for file in sorted((RESULTS / "finetune").glob("*.json")):
         result = json.loads(file.read_text(encoding="utf-8"))
-        task = result["task"]
-        named = {name if name == "scratch" else f"{file.stem}, {name}": curve
-                 for name, curve in result["curves"].items()}  # fmt: skip
-        curves |= named
-    return plot_adaptation(curves, task, RESULTS / "finetune" / "curves.png") if curves else None
+        named = {f"{file.stem}, {name}": curve for name, curve in result["curves"].items()}
+        curves.setdefault(result["task"], {}).update(named)
+    out = RESULTS / "finetune"
+    return [plot_adaptation(found, task, out / f"{task}.png") for task, found in curves.items()]
 
 
 def main() -> int:
@@ -110,11 +109,12 @@ def main() -> int:
     ]
     drawn = []
     for folder, names in GROUPS.items():
-        if len(kept(names)) > 1:
+        # Every task is trained on by some run of "held-out", so its panels would mark none.
+        if len(kept(names)) > 1 and folder != "held-out":
             drawn += plot_learning(kept(names), RESULTS / "figures" / folder)
     for file in sorted(RESULTS.glob(f"*/{INSPECTION}")):
         drawn += plot_inspections([file.parent], file.parent)
-    drawn += [path for path in [adaptation_figure()] if path]
+    drawn += adaptation_figures()
     for path in drawn:
         print(path.relative_to(ROOT), file=sys.stderr)
     for group, names in GROUPS.items():

@@ -122,6 +122,14 @@ RULES = [
         "encoder.goal_fusion=none collect.group_frac=0.5,0,0.5 encoder.aux=contrastive",
         "encoder.aux contrastive with encoder.goal_fusion none",
     ),
+    (
+        "tasks.train=drawer-open encoder.aux=contrastive",
+        "encoder.aux contrastive with one training task",
+    ),
+    (
+        "model.conditioning=task_id tasks.test= encoder.aux=recon",
+        "encoder.aux recon with model.conditioning task_id: no z to train",
+    ),
     ("model.conditioning=task_id", "['window-close'] with model.conditioning task_id"),
     ("model.conditioning=none tasks.test=", "model.net soft with model.conditioning none"),
     ("model.modular_actor=false model.modular_critic=false", "neither modular_actor nor"),
