@@ -40,5 +40,5 @@ def check_inspectable(run: Path) -> None:
     """
     if not (find_run(run) / "policy").is_dir():
         cause = f"--inspect needs a policy checkpoint, and {run / 'policy'} does not exist"
-        cure = "let the run reach a policy checkpoint (checkpoint.policy_every), or leave --inspect out"
+        cure = "let the run reach one (checkpoint.policy_every), or leave --inspect out"
         raise ConfigError(cause, cure)
