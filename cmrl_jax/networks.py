@@ -326,6 +326,7 @@ def make_networks(
             reconstruct = lambda params, obs, action, zc: encode(
                 params, jnp.concatenate([obs, action], axis=-1), zc, method="reconstruct"
             )
+
     return Networks(
         conditioning_size=sizes[model.conditioning],
         init_actor=lambda key: actor_net.init(key, obs, zc),

@@ -17,7 +17,7 @@ from jax.lax import stop_gradient
 
 from cmrl_jax import losses
 from cmrl_jax.config import Config
-from cmrl_jax.context import ContextInference, Transitions
+from cmrl_jax.context import ContextInference, Transitions, init_belief
 from cmrl_jax.distributions import kl_to_standard_normal, sample_tanh_gaussian
 from cmrl_jax.networks import Networks, Params, Routing
 
@@ -113,7 +113,6 @@ def make_objectives(
     """The objectives of one configuration; `inference` is None without an encoder."""
     sac, model = cfg.sac, cfg.model
     is_categorical = model.critic == "c51"
-    has_aux = inference is not None and cfg.encoder.aux != "none"
     support = losses.critic_support(model.critic_v_max, model.critic_bins)
 
     def infer(encoder_params: Params | None, data: Minibatch) -> tuple[jax.Array, jax.Array | None]:
@@ -161,12 +160,12 @@ def make_objectives(
             change = data.next_obs - data.obs
             return jnp.mean(losses.reconstruction_loss(predicted, data.reward, change))
         assert inference is not None and data.context_mask is not None
-        seen, ones = jnp.ones_like(data.context_mask), jnp.ones_like(data.task_ids, jnp.float32)
-        views = [
-            inference.posterior(encoder_params, data.context, mask, data.goal, goal_mask)
-            for mask, goal_mask in ((seen, 0.0 * ones), (0.0 * seen, ones))
-        ]
-        return losses.contrastive_loss(views[0].mean, views[1].mean, data.task_ids)
+        goal, shown = data.goal, jnp.ones(data.task_ids.shape)
+        seen = jnp.ones_like(data.context_mask)
+        experience = inference.posterior(encoder_params, data.context, seen, goal, 0.0 * shown)
+        nothing = init_belief(data.task_ids.shape, inference.latent_dim)
+        text = inference.posterior_of_belief(encoder_params, nothing, goal, shown)
+        return losses.contrastive_loss(experience.mean, text.mean, data.task_ids)
 
     def critic(trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
         zc, kl = infer(trained.encoder, data)
@@ -182,7 +181,7 @@ def make_objectives(
         metrics["q_mean"] = jnp.mean(expected_q(head), axis=(0, 2))
         if clipped is not None:
             metrics["clipped_target_fraction"] = clipped
-        if has_aux:
+        if cfg.encoder.aux != "none":
             metrics["aux_loss"] = auxiliary(trained.encoder, zc, data)
             loss = loss + cfg.encoder.aux_weight * metrics["aux_loss"]
         if kl is not None:

@@ -44,15 +44,20 @@ def applies(control: str, config: Config) -> bool:
     return not control.startswith("text-") or fusion != "none"
 
 
+def kept_file(results: Path, control: str) -> Path:
+    """Where a run's folder of results/ keeps a control."""
+    return results / "controls" / f"{control}.json"
+
+
 def command(name: str, control: str) -> list[str]:
-    run, kept = RUNS / name, RESULTS / name / "controls" / f"{control}.json"
-    words = ["train.py", "eval", "--run", str(run), "--k", K, *shlex.split(CONTROLS[control])]
-    return [*words, "--json", str(kept)]
+    words = ["train.py", "eval", "--run", str(RUNS / name), "--k", K]
+    kept = kept_file(RESULTS / name, control)
+    return [*words, *shlex.split(CONTROLS[control]), "--json", str(kept)]
 
 
 def table(run: Path) -> list[str]:
     """Success at any step of every control, a row a control and a column a task; k side by side."""
-    kept = {name: run / "controls" / f"{name}.json" for name in CONTROLS}
+    kept = {name: kept_file(run, name) for name in CONTROLS}
     found = {
         name: json.loads(path.read_text(encoding="utf-8"))["tasks"]
         for name, path in kept.items()
@@ -84,7 +89,7 @@ def main(words: list[str]) -> int:
     for name in words:
         config = resolve(*read_yaml(ROOT / RUNS / name / "config.yaml"))
         for control in CONTROLS:
-            kept = ROOT / RESULTS / name / "controls" / f"{control}.json"
+            kept = kept_file(ROOT / RESULTS / name, control)
             if kept.exists() or not applies(control, config):
                 continue
             kept.parent.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,6 @@ out, and figures of several runs with fewer than two.
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from pathlib import Path
@@ -18,7 +17,12 @@ sys.path[:0] = [str(ROOT)]
 from cmrl_jax.config import TASKS  # noqa: E402
 from cmrl_jax.config_io import read_yaml, resolve  # noqa: E402
 from cmrl_jax.inspection_file import FILE as INSPECTION  # noqa: E402
-from cmrl_jax.plots import plot_adaptation, plot_inspections, plot_learning  # noqa: E402
+from cmrl_jax.plots import (  # noqa: E402
+    plot_adaptation,
+    plot_inspections,
+    plot_learning,
+    read_metrics,
+)
 from scripts import controls  # noqa: E402
 
 RESULTS = ROOT / "results"
@@ -64,8 +68,7 @@ def table(runs: list[Path]) -> list[str]:
     for run in runs:
         result = json.loads((run / "eval.json").read_text(encoding="utf-8"))
         config = resolve(*read_yaml(run / "config.yaml"))
-        with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = read_metrics(run)
         cells, k = [], ""
         for task in TASKS:
             by_k = result["tasks"].get(task)
@@ -86,8 +89,7 @@ def table(runs: list[Path]) -> list[str]:
 def steps_to_solve(rows: list[dict[str, str]], tasks: tuple[str, ...], k: int) -> str:
     """Env steps at the first evaluation where each of `tasks` succeeds on 0.9 of its goals."""
     for row in rows:
-        scores = [row.get(f"eval/{task}/k{k}/success_any") for task in tasks]
-        if all(scores) and min(float(score or 0) for score in scores) >= 0.9:
+        if min(float(row.get(f"eval/{task}/k{k}/success_any") or 0) for task in tasks) >= 0.9:
             return f"{int(row['env_steps']):,}"
     return "-"
 
