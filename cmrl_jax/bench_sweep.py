@@ -41,8 +41,8 @@ def time_one_by_one(
         table: the sweep's rows, to compare with.
 
     Returns:
-        `cells`, `seconds`, `compile_seconds`; `equal_success`, cells whose success at any step is
-        the sweep's; `largest_return_difference`.
+        `cells`, `seconds`, `cpu_seconds`, `compile_seconds`; `equal_success`, cells whose success
+        at any step is the sweep's; `largest_return_difference`.
     """
     lanes = [
         (target, task, goal)
@@ -62,7 +62,7 @@ def time_one_by_one(
     evaluator = Evaluator(session.config, session.env, session.learner, 1, options.horizon)
     started = time.monotonic()
     evaluator.compile(policies[targets[0]].params, next(iter(trials.values())).texts.shape[-1])
-    compiled = time.monotonic()
+    compiled, worked = time.monotonic(), time.process_time()
     rows = []
     for target, task, goal in (lanes[i] for i in index):
         trial = trials[target, task].of_goal(goal)
@@ -70,7 +70,7 @@ def time_one_by_one(
         common = columns_of(target, options)
         new = cell_rows(of_policy(found, 0), trial.tasks, common)
         rows += [row | {"goal": str(goal)} for row in new]
-    seconds = time.monotonic() - compiled
+    seconds, cpu_seconds = time.monotonic() - compiled, time.process_time() - worked
     swept = [table.find(row) for row in rows]
     differs = [
         abs(float(a["return"]) - float(b["return"])) for a, b in zip(rows, swept, strict=True)
@@ -79,6 +79,7 @@ def time_one_by_one(
     return {
         "cells": len(rows),
         "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
         "compile_seconds": compiled - started,
         "equal_success": sum(equal),
         "largest_return_difference": max(differs),

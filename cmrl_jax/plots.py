@@ -82,9 +82,17 @@ class Runs:
                 if task not in self.tasks:
                     self.tasks.append(task)
 
+    def holds_out(self, group: str, task: str) -> bool:
+        """Whether no run of a group trains on a task."""
+        return not any(task in self.configs[run].tasks.train for run in self.groups[group])
+
     def is_held_out(self, task: str) -> bool:
-        """Whether no run trains on a task."""
-        return not any(task in config.tasks.train for config in self.configs.values())
+        """Whether no run of the figure trains on a task."""
+        return all(self.holds_out(group, task) for group in self.groups)
+
+    def mark(self, group: str, task: str) -> str:
+        """What a label says of a task that the group holds out."""
+        return ", held out" if self.holds_out(group, task) else ""
 
     def curves(self, group: str, column: str) -> list[Series]:
         """A column of every run of a group that has it."""
@@ -155,9 +163,10 @@ def plot_success(runs: Runs, out: Path) -> Path:
                 curves = runs.curves(group, f"train/{task}/success_{rule}")
                 _draw_band(axis, curves, color, style, f"{group}, training, {rule} step")
             k = max(runs.configs[runs.groups[group][0]].eval.k)
-            label = f"{group}, evaluation k = {k}, any step"
+            label = f"{group}, evaluation k = {k}, any step{runs.mark(group, task)}"
+            shape = "x" if runs.holds_out(group, task) else "o"
             for curve in runs.curves(group, f"eval/{task}/k{k}/success_any"):
-                axis.plot(*zip(*curve, strict=True), "o", color=color, ms=4, mfc="w", label=label)
+                axis.plot(*zip(*curve, strict=True), shape, color=color, ms=4, mfc="w", label=label)
             axis.set_xlabel("env steps")
             axis.set_ylim(-0.03, 1.03)
     return _finish(pyplot, figure, list(panels.values()), out)
@@ -174,7 +183,9 @@ def plot_returns(runs: Runs, out: Path) -> Path:
             _draw_band(axis, curves, color, "-", f"{group}, training")
             k = max(runs.configs[runs.groups[group][0]].eval.k)
             curves = runs.curves(group, f"eval/{task}/k{k}/return")
-            _draw_band(axis, curves, color, "--", f"{group}, evaluation k = {k}")
+            label = f"{group}, evaluation k = {k}{runs.mark(group, task)}"
+            style = ":" if runs.holds_out(group, task) else "--"
+            _draw_band(axis, curves, color, style, label)
             axis.set_xlabel("env steps")
     return _finish(pyplot, figure, list(panels.values()), out)
 
@@ -192,8 +203,10 @@ def plot_bars(runs: Runs, out: Path) -> Path:
             k = max(results[0], key=int)
             x = place + (index - (len(runs.groups) - 1) / 2) * width
             figures = [[r[k][f"success_{rule}"] for r in results] for rule in ("any", "last")]
-            label = f"{group}, k = {k} (filled: last step)"
-            axis.bar(x, np.mean(figures[0]), 0.9 * width, ec=f"C{index}", fc="none", label=label)
+            label = f"{group}, k = {k} (filled: last step){runs.mark(group, task)}"
+            hatch = "////" if runs.holds_out(group, task) else None
+            outline: dict[str, Any] = {"ec": f"C{index}", "fc": "none", "hatch": hatch}
+            axis.bar(x, np.mean(figures[0]), 0.9 * width, label=label, **outline)
             axis.bar(x, np.mean(figures[1]), 0.9 * width, color=f"C{index}", alpha=0.45)
             axis.plot([x] * len(results), figures[0], ".", color="k", ms=4)  # the seeds
     axis.set_xticks(
@@ -215,7 +228,8 @@ def plot_k_shot(runs: Runs, out: Path) -> Path:
                 [(float(k), figures["success_any"]) for k, figures in result.items()]
                 for result in runs.final(group, task)
             ]
-            _draw_band(axis, curves, f"C{index}", "-", group)
+            style = ":" if runs.holds_out(group, task) else "-"
+            _draw_band(axis, curves, f"C{index}", style, group + runs.mark(group, task))
             axis.set_xlabel("adaptation episodes k")
             axis.set_ylim(-0.03, 1.03)
     return _finish(pyplot, figure, list(panels.values()), out)

@@ -39,11 +39,16 @@ INTERRUPTED = 130  # exit code after Ctrl-C, as a shell has it
 
 @dataclass
 class Progress:
-    """Cells done and to do, and the seconds that evaluating (not compiling) took."""
+    """Cells done and to do, and the seconds that evaluating (not compiling) took.
+
+    `cpu_seconds` is what the processors worked in them: near `seconds` times the processors, and
+    a sweep is as fast as this machine can be.
+    """
 
     total: int
     cells: int = 0
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     compile_seconds: float = 0.0
 
     def line(self) -> str:
@@ -94,6 +99,7 @@ def sweep(
             "evaluations": evaluations,
             "cells": progress.cells,
             "seconds": progress.seconds,
+            "cpu_seconds": progress.cpu_seconds,
             "compile_seconds": progress.compile_seconds,
             "one_by_one": comparison,
         }
@@ -163,9 +169,10 @@ def run_batch(
 ) -> None:
     """Scores a batch of checkpoints on some tasks and writes the rows."""
     trial = trial_of(policies, session, options, tasks)
-    started = time.monotonic()
+    started, worked = time.monotonic(), time.process_time()
     scores = evaluator.run([p.params for p in policies], trial, batch[0].k, options.seed)
     progress.seconds += time.monotonic() - started
+    progress.cpu_seconds += time.process_time() - worked
     for place, (target, policy) in enumerate(zip(batch, policies, strict=True)):
         common = row_columns(target.run, policy.meta, options, target.config)
         rows = cell_rows(of_policy(scores, place), tasks, common)
@@ -197,6 +204,10 @@ def compared(
         faster = f"the sweep is {ratio:.1f} times as fast" if ratio else "nothing was swept"
         print(f"one by one ({name}): {taken['cells']} cells, {rate:.2f} cells/s; {faster}")
     loop = found["loop"]
+    if progress.cells:
+        together = progress.cpu_seconds / progress.cells
+        alone = loop["cpu_seconds"] / loop["cells"]
+        print(f"processor time a cell: {together:.3f} s in the sweep, {alone:.3f} s in the loop")
     print(f"success as in the sweep in {loop['equal_success']} of {loop['cells']} cells")
     return found
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cmrl_jax.cli import main
+from cmrl_jax.config import TASKS
 from cmrl_jax.config_io import load_config, to_yaml
 from cmrl_jax.plots import Runs, band, read_metrics, series
 
@@ -54,6 +55,19 @@ def test_seeds_of_a_run_are_one_band(run):
     np.testing.assert_allclose(mean, [0, 0.5, 0.7])
     np.testing.assert_allclose([low[-1], high[-1]], [0.6, 0.8])
     assert len(runs.final("soft", "window-open")) == 2 and not runs.final(run.name, "window-open")
+
+
+def test_a_task_is_held_out_by_a_group_or_by_all(run):
+    other = another(run, "other", 0.5)
+    third = another(run, "third", 0.5)
+    tasks = {"tasks.train": "drawer-close,window-open,window-close", "tasks.test": "drawer-open"}
+    (run / "config.yaml").write_text(to_yaml(load_config("smoke.yaml", tasks)))
+    runs = Runs([run, other])
+    assert [runs.holds_out(run.name, task) for task in TASKS] == [True, False, False, False]
+    assert [runs.holds_out("other", task) for task in TASKS] == [False, False, False, True]
+    assert runs.mark(run.name, "drawer-open") and not runs.mark("other", "drawer-open")
+    assert not any(map(runs.is_held_out, TASKS))
+    assert Runs([other, third]).is_held_out("window-close")
 
 
 def test_a_band_reads_longer_runs_between_their_points():

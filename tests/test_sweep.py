@@ -165,8 +165,10 @@ def test_compare_takes_the_same_cells_one_by_one(runs, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_sweep, "COMMANDS", 1)
     path = tmp_path / "c.json"
     assert sweep(runs, None, "--compare", "5", "--json", str(path)) == 0
-    found = json.loads(path.read_text())["one_by_one"]
+    result = json.loads(path.read_text())
+    found = result["one_by_one"]
     loop, commands = found["loop"], found["commands"]
+    assert result["cpu_seconds"] > 0 and loop["cpu_seconds"] > 0
     assert loop["cells"] == 5 * len(KS) == loop["equal_success"]
     assert loop["largest_return_difference"] < 1e-3
     assert commands["cells"] == len(KS)
