@@ -12,8 +12,9 @@ STAMP = $(VENV)/.cmrl-installed
 train: $(STAMP)
 	$(PY) train.py --config $(CONFIG) $(ARGS)
 
+# Two processes, since a test that compiles keeps one core busy; tests of a file share fixtures.
 test: $(STAMP)
-	$(PY) -m pytest $(ARGS)
+	$(PY) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
 
 lint: $(STAMP)
 	$(PY) -m ruff check .
