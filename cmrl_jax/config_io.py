@@ -19,13 +19,20 @@ import yaml
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
 from cmrl_jax.validate import validate
 
-# What a resumed run may change: how long it trains, and what it reports.
+# What a resumed run may change: how long it trains, and what it reports. Not `eval.k`, by which
+# columns of metrics.csv are named.
 FREE_ON_RESUME = (
     "name",
     "train.env_steps",
     "train.minutes",
     "runtime.compile_cache",
-    "eval.",
+    "eval.every",
+    "eval.wall_share",
+    "eval.goals",
+    "eval.final_goals",
+    "eval.final_k",
+    "eval.goal_set",
+    "eval.seed",
     "log.",
     "checkpoint.",
 )

@@ -226,8 +226,12 @@ class _Run:
         if evaluation := format_evaluation(row):
             self.say(evaluation)
         self.console.advance(self.share_done())
-        if self.wall - self.saved_at >= 60 * config.checkpoint.minutes:
+        if self.is_policy_due() or self.wall - self.saved_at >= 60 * config.checkpoint.minutes:
             self.save()
+
+    def is_policy_due(self) -> bool:
+        """Whether this border has a policy checkpoint, however long the iterations took."""
+        return self.done > 0 and self.done % self.config.checkpoint.policy_every == 0
 
     def check_health(self, row: dict[str, Any]) -> None:
         """Warns of what was skipped or put back; stops a run that cannot recover by itself."""
@@ -299,7 +303,7 @@ class _Run:
         self.full.save(split_run(self.state), meta)
         is_last = self.stop.requested or not self.iterations_left()
         # After the full one: a kill in between leaves a policy to write again, not one too many.
-        if self.done and (is_last or self.done % self.config.checkpoint.policy_every == 0):
+        if self.is_policy_due() or (self.done and is_last):
             policy = {
                 "params": policy_params(self.state.learner),
                 "goal_vectors": self.session.goals.vectors[:, 0],

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.checkpoint import full_store, split_run
+from cmrl_jax.checkpoint import full_store, policy_store, split_run
 from cmrl_jax.cli import main
 from cmrl_jax.collect import init_run
 from cmrl_jax.config_io import load_config
@@ -93,8 +93,18 @@ def checkpoint_leaves(run, step=None):
     return leaves_of(trees), meta
 
 
+def policy_steps(run):
+    """Iterations of a run's policy checkpoints."""
+    with policy_store(run, read_only=True) as store:
+        return store.steps()
+
+
 def assert_same_result(run, other):
-    """Bit for bit: every leaf of the newest checkpoint, and all of metrics.csv but the clock."""
+    """Bit for bit: every leaf of the newest checkpoint, and all of metrics.csv but the clock.
+
+    And policy checkpoints of the same iterations.
+    """
+    assert policy_steps(run) == policy_steps(other)
     header = [(r / "metrics.csv").read_bytes().splitlines()[0] for r in (run, other)]
     assert header[0] == header[1]
     assert rows_of(run) == rows_of(other)

@@ -10,6 +10,7 @@ import yaml
 
 from cmrl_jax.config import Config, ConfigError, lane_groups, leaves
 from cmrl_jax.config_io import (
+    FREE_ON_RESUME,
     changed_fields,
     check_resumable,
     find_config,
@@ -267,8 +268,11 @@ def test_resume_may_change_reports_and_length_only():
         "checkpoint.minutes": "1", "runtime.compile_cache": "", "name": "other",
     }  # fmt: skip
     assert changed_fields(saved, load_config("ml4.yaml", free)) == []
+    reports = [name for name, _, _ in leaves(Config()) if name.startswith(("eval.", "log."))]
+    refused = [name for name in reports if not name.startswith(FREE_ON_RESUME)]
+    assert refused == ["eval.k"]  # names columns of metrics.csv
     for name, f, value in leaves(Config()):
-        if name not in free and name.split(".")[0] not in ("eval", "log", "checkpoint"):
+        if name not in free and name not in reports and not name.startswith("checkpoint."):
             section, _, key = name.rpartition(".")
             other = {bool: False if value else True, int: 7, float: 0.7, str: "?", tuple: (9,)}
             owner = getattr(Config(), section) if section else Config()

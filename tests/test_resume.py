@@ -4,7 +4,16 @@ import json
 import subprocess
 import sys
 
-from run_helpers import ITERATIONS, ROOT, assert_same_result, native, rows_of, smoke_words
+from run_helpers import (
+    ITERATIONS,
+    ROOT,
+    assert_same_result,
+    native,
+    policy_steps,
+    rows_of,
+    smoke,
+    smoke_words,
+)
 
 HALF = ITERATIONS // 2
 
@@ -25,3 +34,10 @@ def test_resume_in_a_new_process_equals_an_undisturbed_run(undisturbed, tmp_path
     assert_same_result(run, undisturbed)
     scores = [json.loads((r / "eval.json").read_text()) for r in (run, undisturbed)]
     assert scores[0] == scores[1]
+
+
+def test_policies_are_kept_by_iterations_not_by_the_clock(tmp_path):
+    run = tmp_path / "run"
+    late = "--checkpoint.minutes", "60", "--checkpoint.policy_every", "2"
+    assert smoke(run, *native(5), *late) == 0
+    assert policy_steps(run) == [2, 4, 5]  # the last always
