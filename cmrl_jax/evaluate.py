@@ -113,10 +113,13 @@ class Evaluator:
         """Scores at every k of `k`; arguments as of `episodes`.
 
         Returns:
-            k -> Episode of numpy arrays (policy, task, goal, draw).
+            k -> Episode of numpy arrays (policy, task, goal, draw). Its faults are those of the
+            adaptation episodes, too.
         """
-        played = enumerate(self.episodes(policies, trial, max(k) + 1, seed))
-        scores = {episode: score for episode, (_, score) in played if episode in k}
+        scores, faults = [], 0
+        for _, score in self.episodes(policies, trial, max(k) + 1, seed):
+            faults = faults + score.faults
+            scores.append(score._replace(faults=faults))
         return {n: scores[n] for n in k}
 
     def episodes(

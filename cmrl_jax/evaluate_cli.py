@@ -45,8 +45,6 @@ def evaluate_run(
     scores = of_policy(evaluator.run([policy.params], trial, k, options.seed), 0)
     summary = summarise(scores, tasks)
     print(f"checkpoint {policy.meta['iteration']} of {run}: {describe(options, config)}")
-    if faults := sum(int(episode.faults.sum()) for episode in scores.values()):
-        print(f"warning: lanes left the range of float32 and were put back {faults} times")
     print(format_scores(summary))
     if csv_path is not None:
         with ScoreCsv(csv_path, resume=False) as table:

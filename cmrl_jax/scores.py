@@ -26,6 +26,7 @@ FIGURES = {
     "return": "returns",
     "first_success": "first_success",
     "final_distance": "final_distance",
+    "faults": "faults",
 }
 """Column -> field of `Episode`."""
 SETTINGS = (
@@ -68,7 +69,7 @@ def summarise(scores: Mapping[int, Episode], tasks: Sequence[str]) -> dict[str, 
 
     Returns:
         {task: {k: {"success_any": .., "success_last": .., "return": .., "first_success_step": ..,
-        "final_distance": .., "interval_95": {"success_any": [low, high], ..}}}}.
+        "final_distance": .., "faults": .., "interval_95": {"success_any": [low, high], ..}}}}.
     """
     return {
         task: {
@@ -90,14 +91,26 @@ def _summary(figures: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def format_scores(summary: Mapping[str, Any]) -> str:
-    """A table of an evaluation: success at any and last step and return, per task and k."""
+    """A table of an evaluation: success at any and last step and return, per task and k.
+
+    Below it a line of warning where physics failed.
+    """
     lines = [f"{'task':<14} {'k':>3} {'any step':>9} {'95 %':>11} {'last step':>9} {'return':>8}"]
     for task, by_k in summary.items():
         for k, f in by_k.items():
             low, high = f["interval_95"]["success_any"]
             success = f"{f['success_any']:>9.2f} {low:>6.2f}-{high:.2f} {f['success_last']:>9.2f}"
             lines.append(f"{task:<14} {k:>3} {success} {f['return']:>8.0f}")
-    return "\n".join(lines)
+    return "\n".join(lines + fault_warning(summary))
+
+
+def fault_warning(summary: Mapping[str, Any]) -> list[str]:
+    """One line that names the tasks in which lanes were put back to their start, or none."""
+    worst = {task: max(f["faults"] for f in by_k.values()) for task, by_k in summary.items()}
+    shown = [f"{task} {faults:.2g} times a lane" for task, faults in worst.items() if faults]
+    if not shown:
+        return []
+    return [f"warning: physics became non-finite and was put back: {', '.join(shown)}"]
 
 
 def cell_rows(

@@ -20,7 +20,7 @@ from cmrl_jax.config import TASKS
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.metrics import format_duration
-from cmrl_jax.scores import ScoreCsv, cell_rows, of_policy, summarise_rows
+from cmrl_jax.scores import ScoreCsv, cell_rows, fault_warning, of_policy, summarise_rows
 from cmrl_jax.session import Policy, Session, prepare_jax
 from cmrl_jax.settings import result_fields, row_columns
 from cmrl_jax.targets import (
@@ -235,6 +235,7 @@ def format_sweep(evaluations: Sequence[dict[str, Any]]) -> str:
         for task, by_k in found["tasks"].items():
             figures = "  ".join(f"k{k} {f['success_any']:.2f}" for k, f in by_k.items())
             lines.append(f"  {task:<14} {figures}")
+        lines += fault_warning(found["tasks"])
     return "\n".join(lines)
 
 

@@ -40,7 +40,7 @@ from cmrl_jax.metrics import (
     write_versions,
 )
 from cmrl_jax.run_dir import write_text
-from cmrl_jax.scores import format_scores, of_policy, summarise
+from cmrl_jax.scores import fault_warning, format_scores, of_policy, summarise
 from cmrl_jax.session import Session, policy_params, prepare_jax
 from cmrl_jax.stop import StopSignal
 from cmrl_jax.validate import check_devices
@@ -260,6 +260,8 @@ class _Run:
         """Columns of a periodic evaluation: few goals, few k, all tasks."""
         started, evaluation = time.monotonic(), self.config.eval
         summary = self.scores(evaluation.goals, evaluation.k)
+        for line in fault_warning(summary):
+            self.say(line)
         row: dict[str, Any] = {
             f"eval/{task}/k{k}/{figure}": figures[figure]
             for task, by_k in summary.items()

@@ -265,3 +265,13 @@ def test_shuffled_donors_mix_tasks():
     donor = donors("shuffled", lane_id, env_task)
     share = np.mean(env_task[donor] != env_task)
     assert 0.6 < share < 0.9  # 3/4 by chance
+
+
+def test_a_fault_while_adapting_counts_for_what_was_adapted(evaluator, policy, trial, monkeypatch):
+    """A lane that was put back in an exploration episode is not clean at later k."""
+    played = list(evaluator.episodes([policy], trial, 3, seed=3))
+    faulty = [(b, e._replace(faults=e.faults + (i == 1))) for i, (b, e) in enumerate(played)]
+    monkeypatch.setattr(evaluator, "episodes", lambda *args: iter(faulty))
+    scores = evaluator.run([policy], trial, (0, 1, 2), seed=3)
+    assert [int(scores[k].faults.max()) for k in (0, 1, 2)] == [0, 1, 1]
+    assert [int(scores[k].faults.min()) for k in (0, 1, 2)] == [0, 1, 1]

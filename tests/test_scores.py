@@ -95,6 +95,17 @@ def test_the_table_names_every_task_and_k():
     assert f"{success:.2f}" in lines[1]
 
 
+def test_faults_of_the_physics_are_told():
+    assert "warning" not in format_scores(summarise(of_policy(SCORES, 0), TASKS))
+    faults = np.zeros((2, 2, 5, 3), np.int32)
+    faults[0, 1, 2, 0] = 3
+    sick = SCORES | {2: SCORES[2]._replace(faults=faults)}
+    summary = summarise(of_policy(sick, 0), TASKS)
+    assert summary["window-close"]["2"]["faults"] == pytest.approx(3 / 15)
+    [line] = [x for x in format_scores(summary).splitlines() if x.startswith("warning")]
+    assert "window-close 0.2 times" in line and "window-open" not in line
+
+
 def test_rows_hold_every_figure(tmp_path):
     path = tmp_path / "s.csv"
     with ScoreCsv(path, resume=False) as table:
