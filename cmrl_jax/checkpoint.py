@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import orbax.checkpoint as ocp
 
 from cmrl_jax.config import Config, ConfigError
@@ -82,8 +83,6 @@ class CheckpointStore:
         self._manager = ocp.CheckpointManager(
             self.directory, item_names=(*items, "meta"), options=options
         )
-        if not read_only:
-            self._prune()  # what a kill left of a step that was being deleted
 
     def steps(self) -> list[int]:
         """Iterations that can be restored, oldest first."""
@@ -207,8 +206,12 @@ class CheckpointStore:
                 print(f"warning: {error.cause}{tail}", file=sys.stderr)
             if not is_listed(self.directory / str(step)):
                 write_manifest(self.directory / str(step))
+            self._prune()  # what a kill left of a step that was being deleted
             return found
-        raise bad[0][1] if bad else _nothing_saved(self.directory)
+        if not bad:
+            raise _nothing_saved(self.directory)
+        cure = f"put {self.directory} back from a copy, or start a new run"
+        raise DamagedCheckpoint(bad[0][1].cause, cure)
 
     def _set_aside(self, step: int) -> str:
         """Renames a step, so that it is none any more; returns its new name."""
@@ -253,12 +256,20 @@ class CheckpointStore:
         try:
             return self._manager.restore(step, args=ocp.args.Composite(**args))
         except Exception as error:  # orbax, tensorstore and json each have their own classes
+            path = self.directory / str(step)
+            is_sound = is_listed(path) and find_damage(path) is None
+            if is_sound and isinstance(error, (MemoryError, OSError, jax.errors.JaxRuntimeError)):
+                raise  # of the machine, not of the checkpoint
             raise self._damaged(step, f"{type(error).__name__}: {error}") from error
 
     def _damaged(self, step: int, reason: str) -> DamagedCheckpoint:
         path = self.directory / str(step)
         older = [other for other in self.steps() if other < step]
-        cure = f"use an older one: --checkpoint {older[-1]}" if older else "start a new run"
+        cure = "start a new run"
+        if older and self.items == POLICY_ITEMS:
+            cure = f"use an older one: --checkpoint {older[-1]}"
+        elif older:
+            cure = f"resume the run, which goes on from {older[-1]} then"
         lines = reason.strip().splitlines() or ["unknown reason"]
         return DamagedCheckpoint(f"checkpoint {path} is damaged: {lines[0][:200]}", cure)
 

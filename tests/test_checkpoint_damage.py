@@ -128,7 +128,7 @@ def test_damage_that_no_list_tells_of_is_found_by_reading(tmp_path, victim):
         (step / victim).unlink()
     cause, cure = cause_and_cure(tmp_path)
     assert cause.startswith(f"checkpoint {step} is damaged: ") and "\n" not in cause
-    assert cure == "use an older one: --checkpoint 1"
+    assert cure == "resume the run, which goes on from 1 then"
     with checkpoint.full_store(tmp_path) as store:
         assert store.resume(ABSTRACT, Config(), VERSIONS)[1]["iteration"] == 1
 
@@ -140,13 +140,14 @@ def test_a_reader_of_a_damaged_step_is_told_of_an_older_one(tmp_path):
     cause, cure = cause_and_cure(tmp_path)
     path = tmp_path / "ckpt" / "2"
     assert cause == f"checkpoint {path} is damaged: meta/commit_success.txt is missing"
-    assert cure == "use an older one: --checkpoint 1"
+    assert cure == "resume the run, which goes on from 1 then"
     assert restore(tmp_path, step=1)[1]["iteration"] == 1
     shutil.rmtree(tmp_path / "ckpt" / "1" / "meta")
     assert cause_and_cure(tmp_path, step=1)[1] == "start a new run"
     with checkpoint.full_store(tmp_path) as store:
-        with pytest.raises(ConfigError, match="ckpt/2 is damaged"):
+        with pytest.raises(ConfigError, match="ckpt/2 is damaged") as raised:
             store.resume(ABSTRACT, Config(), {})
+    assert raised.value.cure == f"put {tmp_path / 'ckpt'} back from a copy, or start a new run"
     assert sorted(p.name for p in (tmp_path / "ckpt").iterdir()) == ["1", "2"], "nothing to go on"
 
 
@@ -154,8 +155,42 @@ def test_a_step_that_was_being_deleted_is_swept(tmp_path):
     save_steps(tmp_path, 1, 2, 3)
     (tmp_path / "ckpt" / "1" / "learner" / "_METADATA").unlink()
     with checkpoint.full_store(tmp_path, keep=2) as store:
+        assert store.resume(ABSTRACT, Config(), VERSIONS)[1]["iteration"] == 3
         assert store.steps() == [2, 3]
     assert sorted(p.name for p in (tmp_path / "ckpt").iterdir()) == ["2", "3"]
+
+
+def test_fewer_are_kept_only_after_one_was_found_sound(tmp_path):
+    save_steps(tmp_path, 1, 2)
+    (tmp_path / "ckpt" / "2" / "meta" / "metadata").unlink()
+    with checkpoint.full_store(tmp_path, keep=1) as store:
+        assert store.resume(ABSTRACT, Config(), VERSIONS)[1]["iteration"] == 1
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), OSError(errno.EIO, "input/output"), jax.errors.JaxRuntimeError("full")]
+)
+def test_a_machine_that_fails_does_not_make_a_checkpoint_damaged(tmp_path, monkeypatch, error):
+    def fail(*_: object, **__: object):
+        raise error
+
+    save_steps(tmp_path, 1, 2)
+    with checkpoint.full_store(tmp_path) as store:
+        monkeypatch.setattr(store._manager, "restore", fail)
+        with pytest.raises(type(error)):
+            store.resume(ABSTRACT, Config(), VERSIONS)
+    assert sorted(p.name for p in (tmp_path / "ckpt").iterdir()) == ["1", "2"]
+
+
+def test_an_older_policy_is_offered(tmp_path):
+    with checkpoint.policy_store(tmp_path) as store:
+        for step in (1, 2):
+            store.save({"policy": {"actor": jnp.ones(2)}}, make_meta(step))
+    (tmp_path / "policy" / "2" / "meta" / "metadata").unlink()
+    with checkpoint.policy_store(tmp_path, read_only=True) as store:
+        with pytest.raises(ConfigError) as raised:
+            store.restore({"policy": {"actor": jax.ShapeDtypeStruct((2,), jnp.float32)}})
+    assert raised.value.cure == "use an older one: --checkpoint 1"
 
 
 def test_a_step_without_its_list_is_read_and_then_listed(tmp_path):
