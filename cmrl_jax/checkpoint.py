@@ -8,6 +8,7 @@ Each step holds a list of its files with their checksums, which is verified befo
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
@@ -22,7 +23,7 @@ import orbax.checkpoint as ocp
 
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import check_resumable
-from cmrl_jax.manifest import find_damage, is_listed, write_manifest
+from cmrl_jax.manifest import NAME, find_damage, is_listed, write_manifest
 from cmrl_jax.named_arrays import describe, flatten, not_finite, placed, unflatten
 
 FULL_ITEMS = ("learner", "replay", "context")
@@ -307,6 +308,15 @@ def full_store(run: Path, keep: int | None = None, read_only: bool = False) -> C
 def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
     """`DIR/policy`: what acting needs (actor, encoder, observation statistics, goals); all kept."""
     return CheckpointStore(run / "policy", POLICY_ITEMS, None, read_only)
+
+
+def policy_digest(run: Path, step: int) -> str | None:
+    """Twelve digits that tell a policy checkpoint from another of its name; None without its list.
+
+    Of the list of checksums, so no array is read.
+    """
+    path = run / "policy" / str(step) / NAME
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.is_file() else None
 
 
 def split_run(run: Any) -> dict[str, Any]:

@@ -35,12 +35,13 @@ SETTINGS = (
     "goal_set",
     "policy",
     "z",
+    "donors",
     "paraphrases",
     "text_control",
     "text",
     "eval_seed",
 )
-CELL = ("run", "checkpoint", "task", "goal", "draw", "k")
+CELL = ("run", "checkpoint", "policy_sha256", "task", "goal", "draw", "k")
 FACTS = ("config", "train_seed", "env_steps")  # of the checkpoint, for whoever reads the file
 COLUMNS = (*CELL, *FACTS, *SETTINGS, *FIGURES)
 

@@ -6,14 +6,23 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from cmrl_jax.config import Config
-from cmrl_jax.evaluate_flags import EvalOptions
+from cmrl_jax.checkpoint import policy_digest
+from cmrl_jax.config import TASKS, Config
+from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
 from cmrl_jax.metrics import package_versions
 
 
 def horizon_of(options: EvalOptions, config: Config) -> int:
     """Control steps of an episode."""
     return options.horizon or config.env.horizon
+
+
+def donors_of(options: EvalOptions, config: Config) -> str | None:
+    """What decides from which lane another's z comes, None where no lane has another's."""
+    if options.z not in ("shuffled", "other"):
+        return None
+    tasks = sorted(evaluated_tasks(options, config), key=TASKS.index)
+    return f"{'+'.join(tasks)} x {options.goals} goals x {options.draws} draws"
 
 
 def settings(options: EvalOptions, config: Config) -> dict[str, Any]:
@@ -24,6 +33,7 @@ def settings(options: EvalOptions, config: Config) -> dict[str, Any]:
         "goal_set": options.goal_set,
         "policy": options.policy,
         "z": options.z,
+        "donors": donors_of(options, config),
         "paraphrases": options.paraphrases,
         "text_control": options.text_control,
         "text": options.text,
@@ -31,13 +41,18 @@ def settings(options: EvalOptions, config: Config) -> dict[str, Any]:
     }
 
 
+def cell_columns(run: Path, checkpoint: int) -> dict[str, Any]:
+    """The columns that name a checkpoint: another one in its place is not it."""
+    digest = policy_digest(run, checkpoint)
+    return {"run": run.as_posix(), "checkpoint": checkpoint, "policy_sha256": digest}
+
+
 def row_columns(
     run: Path, meta: dict[str, Any], options: EvalOptions, config: Config
 ) -> dict[str, Any]:
     """The columns that all CSV rows of a checkpoint share."""
     facts = {"config": config.name, "train_seed": config.seed, "env_steps": meta["env_steps"]}
-    cell = {"run": run.as_posix(), "checkpoint": meta["iteration"]}
-    return cell | facts | settings(options, config)
+    return cell_columns(run, meta["iteration"]) | facts | settings(options, config)
 
 
 def result_fields(

@@ -12,7 +12,7 @@ from cmrl_jax.config import TASKS, Config, ConfigError
 from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
 from cmrl_jax.scores import ScoreCsv
 from cmrl_jax.session import Policy, Session, load_policy
-from cmrl_jax.settings import settings
+from cmrl_jax.settings import cell_columns, settings
 from cmrl_jax.trials import evaluation_config
 
 
@@ -87,7 +87,7 @@ def pending_tasks(target: Target, options: EvalOptions, table: ScoreCsv) -> tupl
 
 def columns_of(target: Target, options: EvalOptions) -> dict[str, Any]:
     """The columns that name a target's cells."""
-    cell = {"run": target.run.as_posix(), "checkpoint": target.checkpoint}
+    cell = cell_columns(target.run, target.checkpoint)
     return cell | settings(options, target.config)
 
 

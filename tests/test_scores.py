@@ -23,9 +23,11 @@ from cmrl_jax.scores import (
 
 TASKS = ("window-open", "window-close")
 COMMON = {
-    "run": "runs/a", "checkpoint": 20, "config": "cmrl", "train_seed": 0, "env_steps": 9,
+    "run": "runs/a", "checkpoint": 20, "policy_sha256": None,
+    "config": "cmrl", "train_seed": 0, "env_steps": 9,
     "physics": "mjx", "horizon": 200, "goal_set": "heldout", "policy": "deterministic",
-    "z": "posterior", "paraphrases": "train", "text_control": "none", "text": None, "eval_seed": 0,
+    "z": "posterior", "donors": None, "paraphrases": "train", "text_control": "none", "text": None,
+    "eval_seed": 0,
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -12,11 +13,11 @@ from cmrl_jax import sweep as sweep_module
 from cmrl_jax.bench_sweep import command_words
 from cmrl_jax.cli import main
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import eval_parser, options_of, sweep_parser
+from cmrl_jax.evaluate_flags import EvalOptions, eval_parser, options_of, sweep_parser
 from cmrl_jax.flags import parse
 from cmrl_jax.session import Session
 from cmrl_jax.sweep import INTERRUPTED
-from cmrl_jax.targets import targets_of
+from cmrl_jax.targets import columns_of, targets_of
 from cmrl_jax.trials import Plan, fitted, plan_batches
 
 GOALS, KS, TASKS = 3, ("0", "2"), 4
@@ -209,3 +210,22 @@ def test_plans():
         assert 1 <= size < policies * lanes
         assert size <= policies * lanes * 1000 / needed or smaller.policies == 1
     assert fitted(Plan(1, 2), 10**9, 1) == Plan(1, 1)
+
+
+def test_another_policy_in_its_place_is_another_cell(runs, tmp_path):
+    run = shutil.copytree(runs / "b", tmp_path / "b")
+    named = lambda: columns_of(targets_of(run, "all", EvalOptions())[0], EvalOptions())
+    before, listed = named(), run / "policy" / "1" / "sha256.txt"
+    listed.write_text(listed.read_text().replace("a", "b"))  # as of other weights
+    changed = {name for name, value in named().items() if value != before[name]}
+    assert changed == {"policy_sha256"} and before["policy_sha256"]
+
+
+def test_cells_with_anothers_z_are_of_one_set_of_lanes(runs):
+    [target] = targets_of(runs / "b", "all", EvalOptions())
+    base = EvalOptions(goals=50)
+    options = [(base, False), (replace(base, z="shuffled"), True), (replace(base, z="other"), True)]
+    for many, differs in options:
+        few = replace(many, goals=10, tasks=("window-open",))
+        a, b = columns_of(target, few), columns_of(target, many)
+        assert (a != b) == differs
