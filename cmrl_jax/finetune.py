@@ -67,7 +67,7 @@ def finetune_config(
         updates: gradient steps per control step.
         denominator: what rewards are divided by.
     """
-    env = replace(config.env, goal_observable=False)
+    env = config.env  # also from scratch: every way sees the observations of the run
     if adapt == "scratch":
         config = load_config("sac.yaml", {"sac.batch": str(config.sac.batch)})
         sac = config.sac
@@ -210,7 +210,8 @@ class FineTuning:
             config, task, adapt, options.episodes, options.updates, denominator
         )
         env_config = self.config.env
-        self.env = Ml4Env(False, options.physics or env_config.physics, env_config.obs_mode)
+        physics = options.physics or env_config.physics
+        self.env = Ml4Env(env_config.goal_observable, physics, env_config.obs_mode)
         goals = jnp.asarray(text)[None, None]  # (task, paraphrase, G)
         inference = None
         if adapt == "z":

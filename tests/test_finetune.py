@@ -11,8 +11,9 @@ from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tin
 
 from cmrl_jax import finetune
 from cmrl_jax.cli import main
+from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.context import init_belief
-from cmrl_jax.finetune import free_latent, own_belief, restrict, start_state
+from cmrl_jax.finetune import finetune_config, free_latent, own_belief, restrict, start_state
 from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
 from cmrl_jax.learner import make_learner
 from cmrl_jax.replay import ContextBatch
@@ -145,8 +146,24 @@ def test_mistakes_are_refused(undisturbed, refused, words, cause, cure):
 def test_a_network_without_router_has_none_to_adapt():
     config = tiny_config(**VARIANTS["pearl"])
     options = FinetuneOptions("window-close", adapt=ADAPT)
-    with pytest.raises(ValueError, match="no router"):
+    with pytest.raises(ValueError, match="no router\nuse --adapt posterior,z,all,scratch$"):
         check_run(config, options)
+
+
+@pytest.mark.parametrize("variant", ["mtsac", "sac"])
+@pytest.mark.parametrize("adapt", ["posterior", "z", "router", "all"])
+def test_a_run_without_z_adapts_from_scratch_alone(variant, adapt):
+    config = tiny_config(**VARIANTS[variant])
+    with pytest.raises(ConfigError, match="no z\nuse --adapt scratch$"):
+        check_run(config, FinetuneOptions("window-close", adapt=(adapt,)))
+    check_run(config, FinetuneOptions("window-close", adapt=("scratch",)))
+
+
+@pytest.mark.parametrize("adapt", ADAPT)
+def test_every_way_sees_what_the_run_saw(adapt):
+    """The same observations, the goal's position with them where the run had it."""
+    config = replace(tiny_config(), env=replace(Config().env, goal_observable=True))
+    assert finetune_config(config, "window-close", adapt, 2, 1, 1.0).env == config.env
 
 
 def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
