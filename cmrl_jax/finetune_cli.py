@@ -14,7 +14,13 @@ from cmrl_jax.checkpoint import full_store, join_run, split_run
 from cmrl_jax.collect import init_run
 from cmrl_jax.config import Config
 from cmrl_jax.config_io import read_yaml, resolve
-from cmrl_jax.finetune import FineTuning, Score, adaptation_curve, training_denominator
+from cmrl_jax.finetune import (
+    FineTuning,
+    Score,
+    adaptation_curve,
+    finetune_config,
+    training_denominator,
+)
 from cmrl_jax.finetune_flags import FinetuneOptions, check_run
 from cmrl_jax.goals import load_goals
 from cmrl_jax.learner import TrainState
@@ -41,12 +47,18 @@ def finetune_run(
     placements = session.placements(options.goal_set, options.goals, (options.task,))[0]
     placements = np.asarray(placements, np.float32)
     denominator = training_denominator(config, trained)
+    configs = {  # all of them before the first way compiles: one that is refused costs nothing
+        adapt: finetune_config(
+            config, options.task, adapt, options.episodes, options.updates, denominator
+        )
+        for adapt in options.adapt
+    }
     print(
         f"checkpoint {meta['iteration']} of {run}, {options.task}: own episodes, success any/last"
     )
     curves: Curves = {}
-    for adapt in options.adapt:
-        tuning = FineTuning(config, adapt, options.task, trained, text, denominator, options)
+    for adapt, config_of_way in configs.items():
+        tuning = FineTuning(config_of_way, adapt, trained, text, options)
         curves[adapt] = adaptation_curve(
             tuning, options, placements, lambda n, score, adapt=adapt: _say(adapt, n, score)
         )

@@ -17,6 +17,7 @@ from cmrl_jax.finetune import finetune_config, free_latent, own_belief, restrict
 from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
 from cmrl_jax.learner import make_learner
 from cmrl_jax.replay import ContextBatch
+from cmrl_jax.validate import validate
 
 NETWORKS = ("actor_params", "critic_params", "target_critic_params", "encoder_params")
 
@@ -164,6 +165,22 @@ def test_every_way_sees_what_the_run_saw(adapt):
     """The same observations, the goal's position with them where the run had it."""
     config = replace(tiny_config(), env=replace(Config().env, goal_observable=True))
     assert finetune_config(config, "window-close", adapt, 2, 1, 1.0).env == config.env
+
+
+@pytest.mark.parametrize("adapt", ADAPT)
+def test_every_way_is_a_valid_configuration(adapt):
+    """Also with a horizon that sac.yaml's chunk does not divide, and less experience than a batch.
+
+    A combination that cannot be is refused.
+    """
+    config = tiny_config(collect={"lanes": 12, "chunk": 5}, sac={"batch": 64})
+    config = replace(config, env=replace(config.env, horizon=25))
+    validate(config)
+    tuned = finetune_config(config, "window-close", adapt, 2, 1, 1.0)
+    validate(tuned)
+    assert tuned.env.horizon == 25 and tuned.collect.chunk == 5
+    with pytest.raises(ConfigError, match="collect.updates_per_vector_step is -1"):
+        finetune_config(config, "window-close", adapt, 2, -1, 1.0)
 
 
 def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
