@@ -22,7 +22,7 @@ from cmrl_jax.finetune import (
     training_denominator,
 )
 from cmrl_jax.finetune_flags import FinetuneOptions, check_run
-from cmrl_jax.goals import load_goals
+from cmrl_jax.goals import check_same_table, load_goals
 from cmrl_jax.learner import TrainState
 from cmrl_jax.metrics import package_versions
 from cmrl_jax.session import Session, prepare_jax
@@ -36,14 +36,17 @@ def finetune_run(
     """Adapts a run's last full checkpoint to a task; returns the exit code.
 
     Raises:
-        ConfigError: no checkpoint, or the run cannot be adapted so.
+        ConfigError: no checkpoint, another goal table than the run's, or it cannot be adapted so.
     """
     config = resolve(*read_yaml(run / "config.yaml"))
     check_run(config, options)
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
     trained, meta = load_learner(run, config, session)
-    text = load_goals(config.goals.table, (options.task,)).vectors[0, 0]
+    goals = load_goals(config.goals.table, (options.task,))
+    cure = "put that table back, or adapt a run that was trained with this one"
+    check_same_table(goals, meta["goals_sha256"], run, cure)
+    text = goals.vectors[0, 0]
     placements = session.placements(options.goal_set, options.goals, (options.task,))[0]
     placements = np.asarray(placements, np.float32)
     denominator = training_denominator(config, trained)

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
-from cmrl_jax import finetune
+from cmrl_jax import finetune, finetune_cli
 from cmrl_jax.cli import main
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.context import init_belief
 from cmrl_jax.finetune import finetune_config, free_latent, own_belief, restrict, start_state
 from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
+from cmrl_jax.goals import load_goals
 from cmrl_jax.learner import make_learner
 from cmrl_jax.replay import ContextBatch
 from cmrl_jax.validate import validate
@@ -181,6 +182,16 @@ def test_every_way_is_a_valid_configuration(adapt):
     assert tuned.env.horizon == 25 and tuned.collect.chunk == 5
     with pytest.raises(ConfigError, match="collect.updates_per_vector_step is -1"):
         finetune_config(config, "window-close", adapt, 2, -1, 1.0)
+
+
+def test_another_goal_table_is_refused(undisturbed, monkeypatch):
+    """Before any way to adapt is built."""
+    changed = lambda *words: replace(load_goals(*words), sha256="0" * 64)
+    monkeypatch.setattr(finetune_cli, "load_goals", changed)
+    monkeypatch.setattr(finetune_cli, "FineTuning", lambda *_: pytest.fail("it went on"))
+    options = FinetuneOptions("window-close", adapt=("posterior",))
+    with pytest.raises(ConfigError, match="another goal table .*\nput that table back"):
+        finetune_cli.finetune_run(undisturbed, options, None, None)
 
 
 def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
