@@ -1,6 +1,7 @@
 """Fine-tuning: what gradient steps may change, where it starts, and one short run of it."""
 
 import json
+import sys
 from dataclasses import replace
 
 import jax
@@ -182,6 +183,27 @@ def test_every_way_is_a_valid_configuration(adapt):
     assert tuned.env.horizon == 25 and tuned.collect.chunk == 5
     with pytest.raises(ConfigError, match="collect.updates_per_vector_step is -1"):
         finetune_config(config, "window-close", adapt, 2, -1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("figure", "cause", "cure"),
+    [
+        ("/dev/null/f.png", "cannot write /dev/null/f.png", "--figure"),
+        ("f.txt", "f.txt has no ending of a picture", "png"),
+        ("f.png", "needs matplotlib", "pip install"),
+    ],
+)
+def test_a_figure_that_cannot_be_drawn_is_refused_first(
+    undisturbed, refused, tmp_path, monkeypatch, figure, cause, cure
+):
+    if "matplotlib" in cause:
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        monkeypatch.setitem(sys.modules, "matplotlib.backend_bases", None)
+    monkeypatch.setattr(finetune_cli, "finetune_run", lambda *_: pytest.fail("it went on"))
+    words = ["--task", "window-close", "--figure", str(tmp_path / figure)]
+    got = refused("finetune", "--run", str(undisturbed), *words)
+    assert cause in got[0] and cure in got[1]
+    assert not any(tmp_path.glob("f.*"))
 
 
 def test_another_goal_table_is_refused(undisturbed, monkeypatch):
