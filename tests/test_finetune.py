@@ -13,12 +13,22 @@ from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tin
 from cmrl_jax import finetune, finetune_cli
 from cmrl_jax.cli import main
 from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config_io import load_config
 from cmrl_jax.context import init_belief
-from cmrl_jax.finetune import finetune_config, free_latent, own_belief, restrict, start_state
+from cmrl_jax.finetune import (
+    FineTuning,
+    adaptation_curve,
+    finetune_config,
+    free_latent,
+    own_belief,
+    restrict,
+    start_state,
+)
 from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
 from cmrl_jax.goals import load_goals
 from cmrl_jax.learner import make_learner
 from cmrl_jax.replay import ContextBatch
+from cmrl_jax.session import Session
 from cmrl_jax.validate import validate
 
 NETWORKS = ("actor_params", "critic_params", "target_critic_params", "encoder_params")
@@ -228,3 +238,38 @@ def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
     assert curves["posterior"]["0"] == curves["router"]["0"]
     assert result["task"] == "window-close" and result["episodes"] == 2
     assert "router" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def restored(undisturbed):
+    """The run's configuration, its learner's state, a text vector and two placements."""
+    config = load_config(str(undisturbed / "config.yaml"))
+    session = Session(config)
+    trained, _ = finetune_cli.load_learner(undisturbed, config, session)
+    text = load_goals(config.goals.table, ("window-close",)).vectors[0, 0]
+    placements = session.placements("heldout", 2, ("window-close",))[0]
+    return config, trained, text, np.asarray(placements, np.float32)
+
+
+@pytest.mark.parametrize("adapt", ["z", "all", "scratch"])
+def test_own_episodes_change_what_is_adapted(restored, adapt):
+    """The first episode makes no gradient step, the second one does."""
+    config, trained, text, placements = restored
+    options = FinetuneOptions("window-close", episodes=2)
+    tuned = finetune_config(config, options.task, adapt, options.episodes, options.updates, 1.0)
+    tuning = FineTuning(tuned, adapt, trained, text, options)
+    states = []
+
+    def say(episode, score):
+        states.append(jax.device_get(tuning.run.learner))  # a copy: the run's own is donated
+        assert np.isfinite(score).all()
+
+    curve = adaptation_curve(tuning, options, placements, say)
+    assert list(curve) == [0, 1, 2] and tuning.run.replay.size == 2 * config.env.horizon
+    assert not changed(states[0], states[1])
+    moved = changed(states[1], states[2])
+    if adapt == "z":
+        assert moved == {"encoder_params/z"} and curve[0] == curve[1]
+    else:
+        networks = NETWORKS if adapt == "all" else NETWORKS[:3]
+        assert {path.split("/")[0] for path in moved} == set(networks)
