@@ -229,6 +229,10 @@ def _finetune(words: list[str]) -> int:
     options, run = finetune_flags.options_of(args), find_run(args.run)
     finetune_flags.check_run(resolve(*read_yaml(run / "config.yaml")), options)
     writable(args.json)
+    if args.figure is not None:
+        from cmrl_jax import plots
+
+        plots.check_figure(args.figure)
 
     from cmrl_jax import finetune_cli
 

@@ -33,6 +33,7 @@ from cmrl_jax.finetune_flags import FinetuneOptions
 from cmrl_jax.learner import Learner, TrainState, make_learner
 from cmrl_jax.optimizers import init_adam
 from cmrl_jax.replay import ReplayState, stored_transitions
+from cmrl_jax.validate import validate
 from envs.sawyer import Ml4Env
 from envs.tasks import task_id
 
@@ -66,8 +67,12 @@ def finetune_config(
         adapt: see `finetune_flags.ADAPT`.
         updates: gradient steps per control step.
         denominator: what rewards are divided by.
+
+    Raises:
+        ConfigError: a combination that `validate` refuses.
     """
-    env = replace(config.env, goal_observable=False)
+    # Also from scratch: every way sees the observations of the run, in episodes and chunks as its.
+    env, chunk = config.env, config.collect.chunk
     if adapt == "scratch":
         config = load_config("sac.yaml", {"sac.batch": str(config.sac.batch)})
         sac = config.sac
@@ -83,6 +88,7 @@ def finetune_config(
     collect = replace(
         config.collect,
         lanes=1,
+        chunk=chunk,
         group_frac=(0.0, 0.0, 1.0),
         updates_per_vector_step=updates,
         initial="random" if adapt == "scratch" else "prior",
@@ -90,15 +96,17 @@ def finetune_config(
         context_episodes=episodes,
         context_lanes="all",
     )
-    return replace(
+    tuned = replace(
         config,
         env=env,
         sac=sac,
         encoder=encoder,
         collect=collect,
         tasks=replace(config.tasks, train=(task,), test=()),
-        train=replace(config.train, capacity=episodes * env.horizon),
+        train=replace(config.train, capacity=max(episodes * env.horizon, sac.batch)),
     )
+    validate(tuned)
+    return tuned
 
 
 def free_latent(latent_dim: int) -> ContextInference:
@@ -190,34 +198,30 @@ class FineTuning:
     """One way to adapt on one task: its programs, and the run from episode to episode.
 
     Args:
-        config: the run's own.
+        config: of `finetune_config`, for the way and its task.
         adapt: one of `finetune_flags.ADAPT`.
         text: text vector of the task (G,).
-        denominator: what rewards are divided by.
     """
 
     def __init__(
         self,
         config: Config,
         adapt: str,
-        task: str,
         trained: TrainState,
         text: np.ndarray,
-        denominator: float,
         options: FinetuneOptions,
     ):
-        self.config = finetune_config(
-            config, task, adapt, options.episodes, options.updates, denominator
-        )
+        self.config = config
         env_config = self.config.env
-        self.env = Ml4Env(False, options.physics or env_config.physics, env_config.obs_mode)
+        physics = options.physics or env_config.physics
+        self.env = Ml4Env(env_config.goal_observable, physics, env_config.obs_mode)
         goals = jnp.asarray(text)[None, None]  # (task, paraphrase, G)
         inference = None
         if adapt == "z":
             inference = free_latent(self.config.encoder.latent_dim)
         learner = make_learner(self.config, goals, inference=inference)
         self.learner = restrict(learner, adapt)
-        self.text, self.task = text, task
+        self.text, self.task = text, options.task
         iteration = make_train_iteration(
             self.config, self.env, self.learner, goals, None, freeze_statistics=adapt != "scratch"
         )

@@ -14,9 +14,15 @@ from cmrl_jax.checkpoint import full_store, join_run, split_run
 from cmrl_jax.collect import init_run
 from cmrl_jax.config import Config
 from cmrl_jax.config_io import read_yaml, resolve
-from cmrl_jax.finetune import FineTuning, Score, adaptation_curve, training_denominator
+from cmrl_jax.finetune import (
+    FineTuning,
+    Score,
+    adaptation_curve,
+    finetune_config,
+    training_denominator,
+)
 from cmrl_jax.finetune_flags import FinetuneOptions, check_run
-from cmrl_jax.goals import load_goals
+from cmrl_jax.goals import check_same_table, load_goals
 from cmrl_jax.learner import TrainState
 from cmrl_jax.metrics import package_versions
 from cmrl_jax.session import Session, prepare_jax
@@ -30,23 +36,32 @@ def finetune_run(
     """Adapts a run's last full checkpoint to a task; returns the exit code.
 
     Raises:
-        ConfigError: no checkpoint, or the run cannot be adapted so.
+        ConfigError: no checkpoint, another goal table than the run's, or it cannot be adapted so.
     """
     config = resolve(*read_yaml(run / "config.yaml"))
     check_run(config, options)
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
     trained, meta = load_learner(run, config, session)
-    text = load_goals(config.goals.table, (options.task,)).vectors[0, 0]
+    goals = load_goals(config.goals.table, (options.task,))
+    cure = "put that table back, or adapt a run that was trained with this one"
+    check_same_table(goals, meta["goals_sha256"], run, cure)
+    text = goals.vectors[0, 0]
     placements = session.placements(options.goal_set, options.goals, (options.task,))[0]
     placements = np.asarray(placements, np.float32)
     denominator = training_denominator(config, trained)
+    configs = {  # all of them before the first way compiles: one that is refused costs nothing
+        adapt: finetune_config(
+            config, options.task, adapt, options.episodes, options.updates, denominator
+        )
+        for adapt in options.adapt
+    }
     print(
         f"checkpoint {meta['iteration']} of {run}, {options.task}: own episodes, success any/last"
     )
     curves: Curves = {}
-    for adapt in options.adapt:
-        tuning = FineTuning(config, adapt, options.task, trained, text, denominator, options)
+    for adapt, config_of_way in configs.items():
+        tuning = FineTuning(config_of_way, adapt, trained, text, options)
         curves[adapt] = adaptation_curve(
             tuning, options, placements, lambda n, score, adapt=adapt: _say(adapt, n, score)
         )

@@ -89,15 +89,19 @@ def check_run(config: Config, options: FinetuneOptions) -> None:
     """Whether a run can be adapted so.
 
     Raises:
-        ConfigError: it was trained on the task, or has no part of that name.
+        ConfigError: it was trained on the task, or lacks a part that a way to adapt needs.
     """
     if options.task in config.tasks.train:
         held = [task for task in TASKS if task not in config.tasks.train]
         cause = f"the run was trained on {options.task}"
         raise ConfigError(cause, f"give --task one of: {', '.join(held) or 'none is left'}")
+    # Without z a network is told the training tasks' one-hot, or nothing: no part of it is made for
+    # another task.
     has = {"z": config.model.conditioning == "z", "router": config.model.net == "soft"}
-    has["posterior"] = has["z"]
-    if missing := [word for word in options.adapt if not has.get(word, True)]:
-        left = [word for word in options.adapt if word not in missing]
-        cause = f"--adapt {missing[0]}: the run has no {missing[0]}"
-        raise ConfigError(cause, f"use --adapt {','.join(left) or 'all,scratch'}")
+    needs = {"posterior": ("z",), "z": ("z",), "router": ("z", "router"), "all": ("z",)}
+    lacks = {way: [part for part in needs.get(way, ()) if not has[part]] for way in ADAPT}
+    if missing := [way for way in options.adapt if lacks[way]]:
+        left = [way for way in options.adapt if not lacks[way]]
+        left = left or [way for way in ADAPT if not lacks[way]]
+        cause = f"--adapt {missing[0]}: the run has no {lacks[missing[0]][0]}"
+        raise ConfigError(cause, f"use --adapt {','.join(left)}")

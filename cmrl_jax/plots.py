@@ -22,6 +22,7 @@ import numpy as np
 
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.flags import writable
 from cmrl_jax.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.inspection_file import read_inspection
 
@@ -292,6 +293,23 @@ def plot_inspections(runs: Sequence[Path], out: Path) -> list[Path]:
             if shown:
                 drawn.append(plot(pyplot, shown, out / file))
     return drawn
+
+
+def check_figure(path: Path) -> None:
+    """Fails before hours of episodes rather than after, at `plot_adaptation`.
+
+    Raises:
+        ConfigError: matplotlib is not installed, has no such kind of picture, or the file cannot
+            be written.
+    """
+    try:
+        from matplotlib.backend_bases import FigureCanvasBase
+    except ImportError as error:
+        cure = "pip install 'cmrl-jax[viz]'"
+        raise ConfigError("--figure needs matplotlib, which is not installed", cure) from error
+    if path.suffix.lower().removeprefix(".") not in FigureCanvasBase.filetypes:
+        raise ConfigError(f"--figure {path} has no ending of a picture", "give it one, as F.png")
+    writable(path, "--figure")
 
 
 def plot_adaptation(curves: dict[str, dict[str, dict[str, float]]], task: str, out: Path) -> Path:

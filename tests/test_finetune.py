@@ -1,6 +1,7 @@
 """Fine-tuning: what gradient steps may change, where it starts, and one short run of it."""
 
 import json
+import sys
 from dataclasses import replace
 
 import jax
@@ -9,13 +10,26 @@ import numpy as np
 import pytest
 from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
-from cmrl_jax import finetune
+from cmrl_jax import finetune, finetune_cli
 from cmrl_jax.cli import main
+from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config_io import load_config
 from cmrl_jax.context import init_belief
-from cmrl_jax.finetune import free_latent, own_belief, restrict, start_state
+from cmrl_jax.finetune import (
+    FineTuning,
+    adaptation_curve,
+    finetune_config,
+    free_latent,
+    own_belief,
+    restrict,
+    start_state,
+)
 from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
+from cmrl_jax.goals import load_goals
 from cmrl_jax.learner import make_learner
 from cmrl_jax.replay import ContextBatch
+from cmrl_jax.session import Session
+from cmrl_jax.validate import validate
 
 NETWORKS = ("actor_params", "critic_params", "target_critic_params", "encoder_params")
 
@@ -145,8 +159,71 @@ def test_mistakes_are_refused(undisturbed, refused, words, cause, cure):
 def test_a_network_without_router_has_none_to_adapt():
     config = tiny_config(**VARIANTS["pearl"])
     options = FinetuneOptions("window-close", adapt=ADAPT)
-    with pytest.raises(ValueError, match="no router"):
+    with pytest.raises(ValueError, match="no router\nuse --adapt posterior,z,all,scratch$"):
         check_run(config, options)
+
+
+@pytest.mark.parametrize("variant", ["mtsac", "sac"])
+@pytest.mark.parametrize("adapt", ["posterior", "z", "router", "all"])
+def test_a_run_without_z_adapts_from_scratch_alone(variant, adapt):
+    config = tiny_config(**VARIANTS[variant])
+    with pytest.raises(ConfigError, match="no z\nuse --adapt scratch$"):
+        check_run(config, FinetuneOptions("window-close", adapt=(adapt,)))
+    check_run(config, FinetuneOptions("window-close", adapt=("scratch",)))
+
+
+@pytest.mark.parametrize("adapt", ADAPT)
+def test_every_way_sees_what_the_run_saw(adapt):
+    """The same observations, the goal's position with them where the run had it."""
+    config = replace(tiny_config(), env=replace(Config().env, goal_observable=True))
+    assert finetune_config(config, "window-close", adapt, 2, 1, 1.0).env == config.env
+
+
+@pytest.mark.parametrize("adapt", ADAPT)
+def test_every_way_is_a_valid_configuration(adapt):
+    """Also with a horizon that sac.yaml's chunk does not divide, and less experience than a batch.
+
+    A combination that cannot be is refused.
+    """
+    config = tiny_config(collect={"lanes": 12, "chunk": 5}, sac={"batch": 64})
+    config = replace(config, env=replace(config.env, horizon=25))
+    validate(config)
+    tuned = finetune_config(config, "window-close", adapt, 2, 1, 1.0)
+    validate(tuned)
+    assert tuned.env.horizon == 25 and tuned.collect.chunk == 5
+    with pytest.raises(ConfigError, match="collect.updates_per_vector_step is -1"):
+        finetune_config(config, "window-close", adapt, 2, -1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("figure", "cause", "cure"),
+    [
+        ("/dev/null/f.png", "cannot write /dev/null/f.png", "--figure"),
+        ("f.txt", "f.txt has no ending of a picture", "png"),
+        ("f.png", "needs matplotlib", "pip install"),
+    ],
+)
+def test_a_figure_that_cannot_be_drawn_is_refused_first(
+    undisturbed, refused, tmp_path, monkeypatch, figure, cause, cure
+):
+    if "matplotlib" in cause:
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        monkeypatch.setitem(sys.modules, "matplotlib.backend_bases", None)
+    monkeypatch.setattr(finetune_cli, "finetune_run", lambda *_: pytest.fail("it went on"))
+    words = ["--task", "window-close", "--figure", str(tmp_path / figure)]
+    got = refused("finetune", "--run", str(undisturbed), *words)
+    assert cause in got[0] and cure in got[1]
+    assert not any(tmp_path.glob("f.*"))
+
+
+def test_another_goal_table_is_refused(undisturbed, monkeypatch):
+    """Before any way to adapt is built."""
+    changed = lambda *words: replace(load_goals(*words), sha256="0" * 64)
+    monkeypatch.setattr(finetune_cli, "load_goals", changed)
+    monkeypatch.setattr(finetune_cli, "FineTuning", lambda *_: pytest.fail("it went on"))
+    options = FinetuneOptions("window-close", adapt=("posterior",))
+    with pytest.raises(ConfigError, match="another goal table .*\nput that table back"):
+        finetune_cli.finetune_run(undisturbed, options, None, None)
 
 
 def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
@@ -161,3 +238,38 @@ def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
     assert curves["posterior"]["0"] == curves["router"]["0"]
     assert result["task"] == "window-close" and result["episodes"] == 2
     assert "router" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def restored(undisturbed):
+    """The run's configuration, its learner's state, a text vector and two placements."""
+    config = load_config(str(undisturbed / "config.yaml"))
+    session = Session(config)
+    trained, _ = finetune_cli.load_learner(undisturbed, config, session)
+    text = load_goals(config.goals.table, ("window-close",)).vectors[0, 0]
+    placements = session.placements("heldout", 2, ("window-close",))[0]
+    return config, trained, text, np.asarray(placements, np.float32)
+
+
+@pytest.mark.parametrize("adapt", ["z", "all", "scratch"])
+def test_own_episodes_change_what_is_adapted(restored, adapt):
+    """The first episode makes no gradient step, the second one does."""
+    config, trained, text, placements = restored
+    options = FinetuneOptions("window-close", episodes=2)
+    tuned = finetune_config(config, options.task, adapt, options.episodes, options.updates, 1.0)
+    tuning = FineTuning(tuned, adapt, trained, text, options)
+    states = []
+
+    def say(episode, score):
+        states.append(jax.device_get(tuning.run.learner))  # a copy: the run's own is donated
+        assert np.isfinite(score).all()
+
+    curve = adaptation_curve(tuning, options, placements, say)
+    assert list(curve) == [0, 1, 2] and tuning.run.replay.size == 2 * config.env.horizon
+    assert not changed(states[0], states[1])
+    moved = changed(states[1], states[2])
+    if adapt == "z":
+        assert moved == {"encoder_params/z"} and curve[0] == curve[1]
+    else:
+        networks = NETWORKS if adapt == "all" else NETWORKS[:3]
+        assert {path.split("/")[0] for path in moved} == set(networks)
