@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
+
 from cmrl_jax.bench_sweep import time_commands, time_one_by_one
 from cmrl_jax.config import TASKS
 from cmrl_jax.evaluate import Evaluator
@@ -88,7 +90,9 @@ def sweep(
                 evaluate_group({t: todo[t] for t in members if todo[t]}, options, table, progress)
                 if compare and comparison is None:
                     comparison = compared(members, options, table, compare, progress)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
+            if not is_interrupt(error):
+                raise
             where = "nothing was kept: add --csv F" if csv_path is None else "repeat it to go on"
             print(f"stopped after {progress.cells:,} of {progress.total:,} cells; {where}")
             return INTERRUPTED
@@ -105,6 +109,11 @@ def sweep(
         }
         json_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     return 0
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether Ctrl-C is behind an error: in a host callback, as MuJoCo C has, jax wraps it."""
+    return isinstance(error, KeyboardInterrupt) or KeyboardInterrupt.__name__ in str(error)
 
 
 def evaluate_group(

@@ -19,6 +19,7 @@ from cmrl_jax.session import Session
 from cmrl_jax.sweep import INTERRUPTED
 from cmrl_jax.targets import columns_of, targets_of
 from cmrl_jax.trials import Plan, fitted, plan_batches
+from envs.native import NativePhysics
 
 GOALS, KS, TASKS = 3, ("0", "2"), 4
 PROTOCOL = ["--goals", str(GOALS), "--k", ",".join(KS)]
@@ -229,3 +230,19 @@ def test_cells_with_anothers_z_are_of_one_set_of_lanes(runs):
         few = replace(many, goals=10, tasks=("window-open",))
         a, b = columns_of(target, few), columns_of(target, many)
         assert (a != b) == differs
+
+
+def test_ctrl_c_while_mujoco_steps_stops_the_sweep(runs, tmp_path, monkeypatch, capsys):
+    simulate, calls = NativePhysics._simulate, []
+
+    def interrupted(self, *args):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt  # what Python raises where Ctrl-C finds it
+        return simulate(self, *args)
+
+    monkeypatch.setattr(NativePhysics, "_simulate", interrupted)
+    path = tmp_path / "s.csv"
+    words = ["--runs", str(runs / "b"), "--csv", str(path), *PROTOCOL]
+    assert main(["sweep", *words]) == INTERRUPTED
+    assert "stopped after 0 of" in capsys.readouterr().out
