@@ -89,6 +89,17 @@ def lane_noise(keys: jax.Array, latent_dim: int) -> jax.Array:
     return jax.vmap(lambda key: jax.random.normal(key, (latent_dim,)))(keys)
 
 
+def chunk_keys(config: Config, key: jax.Array, horizon: int) -> jax.Array:
+    """A key (chunk,) for each chunk of an episode, from the same key as `noise_key`'s."""
+    chunk = config.collect.chunk if horizon % config.collect.chunk == 0 else 1
+    return jax.random.split(jax.random.split(key)[1], horizon // chunk)
+
+
+def action_noise(key: jax.Array, lane_id: jax.Array, steps: int) -> jax.Array:
+    """Noise of one lane's actions in a chunk of `steps` steps (time, act), from the chunk's key."""
+    return jax.random.normal(jax.random.fold_in(key, lane_id), (steps, ACTION_SIZE))
+
+
 def add_to_belief(
     learner: Learner,
     inference: ContextInference,
@@ -121,14 +132,14 @@ def make_episode(config: Config, env: Ml4Env, learner: Learner, horizon: int) ->
         policy axis; `deterministic` is () bool.
     """
     inference = learner.inference
-    chunk = config.collect.chunk if horizon % config.collect.chunk == 0 else 1
 
     def episode(params, belief, text, source: ZSource, lanes: Lanes, deterministic, key):
         policies, per_policy = text.shape[:2]
         flat = lambda x: x.reshape(policies * per_policy, *x.shape[2:])
         by_policy = lambda x: x.reshape(policies, per_policy, *x.shape[1:])
         every = lambda x: jnp.broadcast_to(x, (policies, *x.shape))
-        k_act = jax.random.split(key)[1]
+        action_keys = chunk_keys(config, key, horizon)
+        chunk = horizon // len(action_keys)
 
         if inference is None:
             zc = every(learner.task_conditioning(lanes.train_row))
@@ -150,8 +161,8 @@ def make_episode(config: Config, env: Ml4Env, learner: Learner, horizon: int) ->
 
         def lane_actions(key):
             """Noise of a chunk's actions (time, lane, act), each lane's its own."""
-            keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, lanes.lane_id)
-            noise = jax.vmap(lambda k: jax.random.normal(k, (chunk, ACTION_SIZE)), out_axes=1)(keys)
+            draw = jax.vmap(action_noise, in_axes=(None, 0, None), out_axes=1)
+            noise = draw(key, lanes.lane_id, chunk)
             return jnp.tile(noise, (1, policies, 1))
 
         def run_chunk(carry, key):
@@ -179,8 +190,7 @@ def make_episode(config: Config, env: Ml4Env, learner: Learner, horizon: int) ->
 
         env_task, placement = flat(every(lanes.env_task)), flat(every(lanes.placement))
         state = jax.vmap(env.reset_to)(env_task, placement)
-        keys = jax.random.split(k_act, horizon // chunk)
-        (state, belief), scores = jax.lax.scan(run_chunk, (state, belief), keys)
+        (state, belief), scores = jax.lax.scan(run_chunk, (state, belief), action_keys)
         reward, success, distance = (x.reshape(horizon, -1) for x in scores)
         succeeded = jnp.any(success, 0)
         result = Episode(

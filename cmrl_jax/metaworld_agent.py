@@ -11,8 +11,8 @@ NOTES
 3. The belief takes an episode's transitions in when it is truncated, inside `step`; z is then drawn
    for the next one. `adapt` only freezes the belief: evaluation episodes draw from it and add
    nothing.
-4. A lane's z is the one that `Evaluator` draws for the same lane name and episode number;
-   evaluation episodes go on counting where adaptation stopped.
+4. A lane's z and the noise of its actions are those that `Evaluator` draws for the same lane name
+   and episode number; evaluation episodes go on counting where adaptation stopped.
 """
 
 from __future__ import annotations
@@ -26,7 +26,14 @@ import numpy as np
 
 from cmrl_jax.config import Config
 from cmrl_jax.context import Belief, init_belief
-from cmrl_jax.episode import PolicyParams, add_to_belief, lane_noise, noise_key
+from cmrl_jax.episode import (
+    PolicyParams,
+    action_noise,
+    add_to_belief,
+    chunk_keys,
+    lane_noise,
+    noise_key,
+)
 from cmrl_jax.learner import Learner
 from cmrl_jax.replay import Transition
 from envs.sawyer import ACTION_SIZE, OBJECT, OBS_SIZE, canonical_obs
@@ -77,7 +84,9 @@ class MetaWorldAgent:
         self._key = jax.random.key(seed)
         self._run = -1
         self._frozen = False
-        self._functions = _compile(config, learner, params, train_row, self._lanes, deterministic)
+        self._functions = _compile(
+            config, learner, params, train_row, self._lanes, horizon, deterministic
+        )
 
     @property
     def belief(self) -> Belief | None:
@@ -99,7 +108,10 @@ class MetaWorldAgent:
         self._acted = np.zeros(lanes, bool)  # in the episode at hand
         self._origin = np.zeros((lanes, 3), np.float32)
         self._zc = np.zeros((lanes, self._functions["width"]), np.float32)
-        self._steps = 0
+        self._noise = np.zeros(
+            (lanes, horizon, ACTION_SIZE), np.float32
+        )  # of the episode's actions
+        self._steps = np.zeros(lanes, int)  # acted in the episode at hand
         self._shown = np.zeros((lanes, OBS_SIZE), np.float32)
         self._count = np.zeros(lanes, int)  # transitions of the episode at hand, all whole
         self._pending = np.zeros(lanes, bool)  # one more that still lacks its next observation
@@ -151,13 +163,14 @@ class MetaWorldAgent:
     def _act(self, observations: np.ndarray) -> np.ndarray:
         obs = np.asarray(observations, np.float32)
         if self._starts.any():
-            drawn = np.asarray(self._draw())
-            self._zc[self._starts] = drawn[self._starts]
+            noise = self._functions["noise"](self._key, self._episode, self._lane_id)
+            self._zc[self._starts] = np.asarray(self._draw())[self._starts]
+            self._noise[self._starts] = np.asarray(noise)[self._starts]
             self._origin[self._starts] = obs[self._starts][:, OBJECT]
+            self._steps[self._starts] = 0
             self._starts[:] = False
-        actions, shown = self._functions["act"](
-            obs, self._origin, self._zc, self._key, np.int32(self._steps)
-        )
+        noise = self._noise[np.arange(self._lanes), self._steps]
+        actions, shown = self._functions["act"](obs, self._origin, self._zc, noise)
         self._steps += 1
         self._acted[:] = True
         self._shown = np.asarray(shown)
@@ -188,30 +201,38 @@ def _compile(
     params: PolicyParams,
     train_row: int,
     lanes: int,
+    horizon: int,
     deterministic: bool,
 ) -> Mapping[str, Any]:
-    """The agent's jitted parts: `act`, `draw`, `observe`, and `width` of the conditioning."""
+    """The agent's jitted parts: `act`, `noise`, `draw`, `observe`; `width` of the conditioning."""
     inference = learner.inference
     params = jax.device_put(params)
 
     @jax.jit
-    def act(obs, origin, zc, key, step):
+    def act(obs, origin, zc, noise):
         shown = obs
         if config.env.obs_mode == "canonical":
             shown = canonical_obs(obs, origin, config.env.goal_observable)
+        unused = jax.random.key(0)  # noise is given
         action, _ = learner.policy(
-            params.actor_params,
-            params.obs_stats,
-            shown,
-            zc,
-            jax.random.fold_in(key, step),
-            deterministic,
+            params.actor_params, params.obs_stats, shown, zc, unused, deterministic, noise
         )
         return action, shown
 
+    @jax.jit
+    def noise(key, episode, lane_id):
+        """Noise of a whole episode's actions (lane, time, act)."""
+
+        def of_lane(episode, lane_id):
+            keys = chunk_keys(config, jax.random.fold_in(key, episode), horizon)
+            draw = jax.vmap(action_noise, in_axes=(0, None, None))
+            return draw(keys, lane_id, horizon // len(keys)).reshape(horizon, ACTION_SIZE)
+
+        return jax.vmap(of_lane)(episode, lane_id)
+
     if inference is None:
         told = learner.task_conditioning(jnp.full((lanes,), train_row))
-        return {"act": act, "draw": lambda *args: told, "width": told.shape[-1]}
+        return {"act": act, "noise": noise, "draw": lambda *args: told, "width": told.shape[-1]}
 
     @jax.jit
     def draw(belief, text, mask, key, episode, lane_id):
@@ -226,4 +247,5 @@ def _compile(
         transitions = Transition(terminated=flag, truncated=flag, first=flag, **memory)
         return add_to_belief(learner, inference, params, belief, transitions, mask, text)
 
-    return {"act": act, "draw": draw, "observe": observe, "width": inference.latent_dim}
+    width = inference.latent_dim
+    return {"act": act, "noise": noise, "draw": draw, "observe": observe, "width": width}

@@ -27,6 +27,7 @@ from cmrl_jax.replay import Transition
 from cmrl_jax.session import Policy, Session
 from envs.metaworld_envs import make_vector_env, set_goals
 from envs.reference import record_rollout
+from envs.sawyer import OBS_SIZE
 from envs.tasks import TASKS
 
 LANES = 2
@@ -141,15 +142,17 @@ def test_successes_are_metaworlds(trial):
     envs.close()
 
 
-@pytest.mark.parametrize("z", ["posterior", "prior", "text"])
+@pytest.mark.parametrize("z", ["posterior", "prior", "text", "sampled"])
 def test_without_a_dropped_transition_metaworld_agrees_with_the_native_backend(
     session, policy, trial, z
 ):
     """k = 0 needs no belief: the same latent, the same actions, Meta-World's physics to the bit.
 
-    Prior and text never read one, so they agree at every k.
+    Prior and text never read one, so they agree at every k. Sampled: the text's, sampled actions.
     """
-    trial = replace(trial, z=z, draws=2)
+    deterministic = z != "sampled"
+    z = z if deterministic else "text"
+    trial = replace(trial, z=z, draws=2, deterministic=deterministic)
     ks = (0,) if z == "posterior" else (0, 1)
     evaluator = Evaluator(session.config, session.env, session.learner, lanes=16)
     native = evaluator.run([policy.params], trial, ks, seed=3)
@@ -161,6 +164,28 @@ def test_without_a_dropped_transition_metaworld_agrees_with_the_native_backend(
             np.testing.assert_allclose(found[k].final_distance, wanted.final_distance, atol=1e-4)
             np.testing.assert_array_equal(found[k].success_any, wanted.success_any)
             np.testing.assert_array_equal(found[k].first_success, wanted.first_success)
+
+
+def test_noise_of_sampled_actions_is_the_lanes_episodes_and_steps_own(session, policy, trial):
+    """However long the episode before was, and whatever the other lanes do meanwhile."""
+    one = replace(of_task(trial, 0), z="text", deterministic=False)
+    agent = agent_of(session, policy, one, [np.arange(LANES)], HORIZON, seed=3)
+    seen = np.zeros((LANES, OBS_SIZE))
+
+    def second_episode(steps_before, lanes):
+        agent.init()
+        for _ in range(steps_before):
+            agent.eval_action(seen)
+        agent.reset(np.array(lanes))
+        return np.stack([agent.eval_action(seen) for _ in range(3)], 1)
+
+    wanted = second_episode(1, [True, True])
+    np.testing.assert_array_equal(second_episode(3, [True, True]), wanted)
+    alone = second_episode(3, [False, True])
+    np.testing.assert_array_equal(alone[1], wanted[1])
+    assert not np.array_equal(alone[0], wanted[0])
+    noise = agent._noise
+    assert len(np.unique(noise)) == noise.size == LANES * HORIZON * 4
 
 
 def test_canonical_observations(policy, trial):
