@@ -8,7 +8,6 @@ Each step holds a list of its files with their checksums, which is verified befo
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
@@ -23,7 +22,7 @@ import orbax.checkpoint as ocp
 
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import check_resumable
-from cmrl_jax.manifest import NAME, find_damage, is_listed, write_manifest
+from cmrl_jax.manifest import find_damage, fingerprint, is_listed, write_manifest
 from cmrl_jax.named_arrays import describe, flatten, not_finite, placed, unflatten
 
 FULL_ITEMS = ("learner", "replay", "context")
@@ -311,12 +310,8 @@ def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
 
 
 def policy_digest(run: Path, step: int) -> str | None:
-    """Twelve digits that tell a policy checkpoint from another of its name; None without its list.
-
-    Of the list of checksums, so no array is read.
-    """
-    path = run / "policy" / str(step) / NAME
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:12] if path.is_file() else None
+    """What tells a policy checkpoint from another of its name; None without its list of files."""
+    return fingerprint(run / "policy" / str(step))
 
 
 def split_run(run: Any) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from cmrl_jax.run_dir import find_run, holds_run
 from cmrl_jax.validate import check_goal_set
 
 Z_SOURCES = ("posterior", "prior", "shuffled", "other", "text")
+DONATED = ("shuffled", "other")  # z from another lane's belief: lanes depend on one another
 MAX_GOALS = 50  # a goal set has so many a task
 
 
@@ -184,7 +185,7 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
     ]
     if args.text is not None and changed:
         raise ConfigError(f"--text with {changed[0]}", "give one of the two: each names the text")
-    if args.physics == "metaworld" and args.z in ("shuffled", "other"):
+    if args.physics == "metaworld" and args.z in DONATED:
         cause = f"--z {args.z} with --physics metaworld, where lanes know nothing of each other"
         raise ConfigError(cause, "use --z posterior, prior or text, or --physics native")
     own = {}
@@ -317,7 +318,7 @@ def run_sweep(words: Sequence[str]) -> int:
     """`train.py sweep`; returns the exit code."""
     args = parse(sweep_parser(), words)
     options = options_of(args)
-    if args.compare and options.z in ("shuffled", "other"):
+    if args.compare and options.z in DONATED:
         cause = f"--compare with --z {options.z}, which no adaptation run has by itself"
         raise ConfigError(cause, "leave --compare out, or use --z posterior")
     checkpoints = checkpoint_choice(args.checkpoints)

@@ -24,6 +24,11 @@ def is_listed(directory: Path) -> bool:
     return (directory / NAME).exists()
 
 
+def fingerprint(directory: Path) -> str | None:
+    """Twelve digits that tell listed content from other content, by the list alone; or no list."""
+    return _digest(directory / NAME)[:12] if is_listed(directory) else None
+
+
 def find_damage(directory: Path) -> str | None:
     """What is wrong with the first file not as listed; None if all are, or without a list."""
     if not is_listed(directory):

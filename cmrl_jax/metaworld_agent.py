@@ -108,9 +108,8 @@ class MetaWorldAgent:
         self._acted = np.zeros(lanes, bool)  # in the episode at hand
         self._origin = np.zeros((lanes, 3), np.float32)
         self._zc = np.zeros((lanes, self._functions["width"]), np.float32)
-        self._noise = np.zeros(
-            (lanes, horizon, ACTION_SIZE), np.float32
-        )  # of the episode's actions
+        # Of the actions of the episode at hand.
+        self._noise = np.zeros((lanes, horizon, ACTION_SIZE), np.float32)
         self._steps = np.zeros(lanes, int)  # acted in the episode at hand
         self._shown = np.zeros((lanes, OBS_SIZE), np.float32)
         self._count = np.zeros(lanes, int)  # transitions of the episode at hand, all whole

@@ -107,7 +107,7 @@ class Runs:
         return [result["tasks"][task] for result in read if task in result["tasks"]]
 
 
-def _pyplot() -> Any:
+def _pyplot(needed_by: str = "plot") -> Any:
     try:
         import matplotlib
 
@@ -115,7 +115,7 @@ def _pyplot() -> Any:
         from matplotlib import pyplot
     except ImportError as error:
         cure = "pip install 'cmrl-jax[viz]'"
-        raise ConfigError("plot needs matplotlib, which is not installed", cure) from error
+        raise ConfigError(f"{needed_by} needs matplotlib, which is not installed", cure) from error
     return pyplot
 
 
@@ -302,12 +302,8 @@ def check_figure(path: Path) -> None:
         ConfigError: matplotlib is not installed, has no such kind of picture, or the file cannot
             be written.
     """
-    try:
-        from matplotlib.backend_bases import FigureCanvasBase
-    except ImportError as error:
-        cure = "pip install 'cmrl-jax[viz]'"
-        raise ConfigError("--figure needs matplotlib, which is not installed", cure) from error
-    if path.suffix.lower().removeprefix(".") not in FigureCanvasBase.filetypes:
+    figure = _pyplot("--figure").Figure()
+    if path.suffix.lower().removeprefix(".") not in figure.canvas.get_supported_filetypes():
         raise ConfigError(f"--figure {path} has no ending of a picture", "give it one, as F.png")
     writable(path, "--figure")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from cmrl_jax.checkpoint import policy_digest
 from cmrl_jax.config import TASKS, Config
-from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
+from cmrl_jax.evaluate_flags import DONATED, EvalOptions, evaluated_tasks
 from cmrl_jax.metrics import package_versions
 
 
@@ -19,7 +19,7 @@ def horizon_of(options: EvalOptions, config: Config) -> int:
 
 def donors_of(options: EvalOptions, config: Config) -> str | None:
     """What decides from which lane another's z comes, None where no lane has another's."""
-    if options.z not in ("shuffled", "other"):
+    if options.z not in DONATED:
         return None
     tasks = sorted(evaluated_tasks(options, config), key=TASKS.index)
     return f"{'+'.join(tasks)} x {options.goals} goals x {options.draws} draws"

@@ -20,7 +20,7 @@ import jax
 from cmrl_jax.bench_sweep import time_commands, time_one_by_one
 from cmrl_jax.config import TASKS
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import EvalOptions
+from cmrl_jax.evaluate_flags import DONATED, EvalOptions
 from cmrl_jax.metrics import format_duration
 from cmrl_jax.scores import ScoreCsv, cell_rows, fault_warning, of_policy, summarise_rows
 from cmrl_jax.session import Policy, Session, prepare_jax
@@ -132,7 +132,7 @@ def evaluate_group(
     for tasks, members in itertools.groupby(targets, todo.__getitem__):
         # Donors of a whole evaluation stay together; else as few tasks as fill a batch, so that
         # their rows are written early.
-        whole = options.z in ("shuffled", "other")
+        whole = options.z in DONATED
         parts = [tasks] if whole else list(chunks(tasks, max(1, evaluator.lanes // per_task)))
         for batch in chunks(list(members), evaluator.policies):
             policies = [load_target(target, session) for target in batch]

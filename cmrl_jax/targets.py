@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from cmrl_jax.checkpoint import policy_store
 from cmrl_jax.config import TASKS, Config, ConfigError
-from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
+from cmrl_jax.evaluate_flags import DONATED, EvalOptions, evaluated_tasks
 from cmrl_jax.scores import ScoreCsv
 from cmrl_jax.session import Policy, Session, load_policy
 from cmrl_jax.settings import cell_columns, settings
@@ -82,7 +82,7 @@ def pending_tasks(target: Target, options: EvalOptions, table: ScoreCsv) -> tupl
         )
 
     pending = tuple(task for task in target.tasks if not is_done(task))
-    return target.tasks if pending and options.z in ("shuffled", "other") else pending
+    return target.tasks if pending and options.z in DONATED else pending
 
 
 def columns_of(target: Target, options: EvalOptions) -> dict[str, Any]:
