@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cmrl_jax import evaluate_flags, finetune_flags, plot_flags, render_flags
-from cmrl_jax.config import Config, ConfigError, leaves, suggest
+from cmrl_jax.commands import program
+from cmrl_jax.config import Config, ConfigError, call_envs, leaves, suggest
 from cmrl_jax.config_io import (
     check_resumable,
     config_dirs,
@@ -26,7 +27,7 @@ from cmrl_jax.config_io import (
     resolve,
     to_yaml,
 )
-from cmrl_jax.flags import Parser, names, parse, shown, writable
+from cmrl_jax.flags import Parser, names, parse, parser_of, shown, writable
 from cmrl_jax.goal_files import find_table
 from cmrl_jax.run_dir import (
     config_stem,
@@ -37,6 +38,7 @@ from cmrl_jax.run_dir import (
     writing_to,
 )
 from cmrl_jax.stop import StopSignal
+from envs.command_line import typed_path
 
 COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "goals")
 
@@ -76,14 +78,16 @@ def _dispatch(words: list[str]) -> int:
 def train_parser() -> argparse.ArgumentParser:
     """Flags of `train`: one for each leaf of the config schema, with its text and default."""
     parser = Parser(
-        prog="python train.py",
-        usage="python train.py --config X.yaml [--section.key VALUE ...] [--run DIR] [--resume]",
+        prog=program(),
+        usage="%(prog)s --config X.yaml [--section.key VALUE ...] [--run DIR] [--resume]",
         description="Meta-trains on the tasks of a YAML config, in one process, on any device.",
         epilog=f"commands: {', '.join(COMMANDS)}; each has its own --help",
         allow_abbrev=False,
     )
-    parser.add_argument("--config", metavar="X.yaml", help="a file, or a name in configs/")
-    parser.add_argument("--run", metavar="DIR", type=Path, help="run directory [runs/X-TIME]")
+    parser.add_argument(
+        "--config", metavar="X.yaml", type=typed_path, help="a file, or a name in configs/"
+    )
+    parser.add_argument("--run", metavar="DIR", type=typed_path, help="run directory [runs/X-TIME]")
     parser.add_argument(
         "--resume", action="store_true", help="go on with --run DIR, or with the newest run of X"
     )
@@ -115,7 +119,7 @@ def _train(words: list[str]) -> int:
     args = vars(parse(train_parser(), words))
     name, run, resume = args.pop("config"), args.pop("run"), args.pop("resume")
     if name is None and run is not None and resume:
-        name = str(find_run(run) / "config.yaml")
+        name = find_run(run) / "config.yaml"
     if name is None:
         found = sorted({p.name for d in config_dirs()[1:] for p in d.glob("*.yaml")})
         raise ConfigError("no --config given", f"add --config with one of: {', '.join(found)}")
@@ -147,10 +151,8 @@ def _check_extras(config: Config) -> None:
 
 
 def _plot(words: list[str]) -> int:
-    parser = Parser(
-        prog="python train.py plot", description=plot_flags.DESCRIPTION, allow_abbrev=False
-    )
-    args = parse(plot_flags.add_flags(parser), words)
+    args = parse(plot_flags.add_flags(parser_of("plot", plot_flags.DESCRIPTION)), words)
+    plot_flags.check_runs(args.run)
     inspected, out = args.run if args.inspect else (), args.out or args.run[0] / "plots"
     for run in inspected:
         plot_flags.check_inspectable(run)
@@ -171,16 +173,13 @@ def _plot(words: list[str]) -> int:
 
 def bench_parser() -> argparse.ArgumentParser:
     """Flags of `bench`."""
-    parser = Parser(
-        prog="python train.py bench",
-        description="Measures physics, learner, start-up and memory on this machine.",
-        allow_abbrev=False,
-    )
+    text = "Measures physics, learner, start-up and memory on this machine."
+    parser = parser_of("bench", text)
     parser.add_argument(
         "--rows", type=names, default=(), metavar="A,B", help="only rows of these kinds"
     )
     parser.add_argument(
-        "--json", type=Path, default=Path("bench.json"), metavar="F", help="[bench.json]"
+        "--json", type=typed_path, default=Path("bench.json"), metavar="F", help="[bench.json]"
     )
     return parser
 
@@ -195,17 +194,12 @@ def _bench(words: list[str]) -> int:
 
 
 def _render(words: list[str]) -> int:
-    parser = Parser(
-        prog="python train.py render", description=render_flags.DESCRIPTION, allow_abbrev=False
-    )
+    parser = parser_of("render", render_flags.DESCRIPTION)
     options = render_flags.options_of(parse(render_flags.add_flags(parser), words))
 
     from envs.render import choose_gl
 
-    try:
-        choose_gl()  # before anything imports mujoco
-    except ValueError as error:
-        raise ConfigError(*str(error).split("\n")) from error
+    call_envs(choose_gl)  # before anything imports mujoco
     from cmrl_jax import render
 
     return render.render_run(**options)
@@ -214,17 +208,13 @@ def _render(words: list[str]) -> int:
 def _goals(words: list[str]) -> int:
     from cmrl_jax import goals_cli
 
-    parser = Parser(
-        prog="python train.py goals", description=goals_cli.DESCRIPTION, allow_abbrev=False
-    )
+    parser = parser_of("goals", goals_cli.DESCRIPTION)
     goals_cli.add_flags(parser)
     return goals_cli.run(parse(parser, words))
 
 
 def _finetune(words: list[str]) -> int:
-    parser = Parser(
-        prog="python train.py finetune", description=finetune_flags.DESCRIPTION, allow_abbrev=False
-    )
+    parser = parser_of("finetune", finetune_flags.DESCRIPTION)
     args = parse(finetune_flags.add_flags(parser), words)
     options, run = finetune_flags.options_of(args), find_run(args.run)
     finetune_flags.check_run(resolve(*read_yaml(run / "config.yaml")), options)

@@ -10,13 +10,21 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any, Literal
+
+from envs.goal_names import GOALS, LARGEST_SEED
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 TEXT_ENCODERS = ("minilm-l6-v2", "clip-vit-b-32")  # the table of the first is packaged
 GOAL_ABLATIONS = ("one-hot", "zero", "shuffled")
+# Beyond these, what is counted in 32 bits (steps of an episode, episodes by which draws are named,
+# slots of a ring and how far a window reaches past them) would wrap, or no memory would hold it.
+MOST_STEPS = 100_000  # control steps of an episode
+MOST_EPISODES = 10_000  # adaptation episodes, and episodes of fine-tuning
+MOST_UPDATES = 10_000  # gradient steps a control step
+LARGEST_RING = 2**30  # transitions of a task
 
 
 class ConfigError(ValueError):
@@ -28,12 +36,24 @@ class ConfigError(ValueError):
         self.cure = cure
 
 
+def call_envs(build: Callable[[], Any]) -> Any:
+    """Calls into `envs`, whose ValueErrors carry cause and cure on two lines."""
+    try:
+        return build()
+    except ValueError as error:
+        cause, _, cure = str(error).partition("\n")
+        if not cure:
+            raise
+        raise ConfigError(cause, cure) from error
+
+
 def doc(
     default: Any, text: str, above: float | None = None, low: float = 0, high: float | None = None
 ) -> Any:
     """A dataclass field with its help text and the bounds of its number or of its numbers.
 
-    `low <= value <= high`; with `above`, `value > above`. No number of the schema may be negative.
+    `low <= value <= high`; with `above`, `value > above`. No number of the schema may be negative,
+    and no whole number above `LARGEST` unless `high` says so.
     """
     bounds = {"above": above, "low": low, "high": high}
     return field(default=default, metadata={"doc": text, **bounds})
@@ -52,7 +72,10 @@ class EnvConfig:
     )
     impl: Literal["jax", "warp"] = doc("jax", "MJX implementation")
     horizon: int = doc(
-        200, "control steps an episode lasts; a time limit, never a terminal", above=0
+        200,
+        "control steps an episode lasts; a time limit, never a terminal",
+        above=0,
+        high=MOST_STEPS,
     )
     goal_observable: bool = doc(False, "show the target position in the observation")
     variation: Literal["episode_random", "fixed_50"] = doc(
@@ -154,7 +177,9 @@ class SacConfig:
 class CollectConfig:
     lanes: int = doc(96, "E: parallel environments, equally many of each training task", above=0)
     chunk: int = doc(10, "control steps between two blocks of gradient steps", above=0)
-    updates_per_vector_step: int = doc(4, "gradient steps per control step of all lanes", above=0)
+    updates_per_vector_step: int = doc(
+        4, "gradient steps per control step of all lanes", above=0, high=MOST_UPDATES
+    )
     group_frac: tuple[float, float, float] = doc(
         (0.25, 0.25, 0.5), "shares of lanes whose z is drawn from prior, text, posterior", high=1
     )
@@ -175,10 +200,13 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    env_steps: int = doc(1_000_000, "control steps of all lanes together; 0: no limit")
+    env_steps: int = doc(1_000_000, "control steps of all lanes together; 0: no limit", high=10**12)
     minutes: float = doc(0.0, "wall-time limit of the whole run, final evaluation apart; 0: none")
     capacity: int = doc(
-        102_400, "replay transitions per task; a multiple of the lanes of a task", above=0
+        102_400,
+        "replay transitions per task; a multiple of the lanes of a task",
+        above=0,
+        high=LARGEST_RING,
     )
 
 
@@ -188,12 +216,16 @@ class EvalConfig:
     wall_share: float = doc(
         0.1, "at most this share of the wall time goes to evaluation", above=0, high=1
     )
-    goals: int = doc(10, "goals a task in the periodic evaluation", above=0, high=50)
-    k: tuple[int, ...] = doc((0, 2), "adaptation episodes in the periodic evaluation")
-    final_goals: int = doc(50, "goals a task in the final evaluation", above=0, high=50)
-    final_k: tuple[int, ...] = doc((0, 1, 2), "adaptation episodes in the final evaluation")
+    goals: int = doc(10, "goals a task in the periodic evaluation", above=0, high=GOALS)
+    k: tuple[int, ...] = doc(
+        (0, 2), "adaptation episodes in the periodic evaluation", high=MOST_EPISODES
+    )
+    final_goals: int = doc(50, "goals a task in the final evaluation", above=0, high=GOALS)
+    final_k: tuple[int, ...] = doc(
+        (0, 1, 2), "adaptation episodes in the final evaluation", high=MOST_EPISODES
+    )
     goal_set: str = doc("heldout", "named goal set: train, heldout or fresh:<seed>")
-    seed: int = doc(0, "seed of the evaluation's own draws", high=2**31 - 1)
+    seed: int = doc(0, "seed of the evaluation's own draws", high=LARGEST_SEED)
 
 
 @dataclass(frozen=True)
@@ -220,7 +252,7 @@ class RuntimeConfig:
 @dataclass(frozen=True)
 class Config:
     name: str = doc("cmrl", "name of the preset, recorded with the run")
-    seed: int = doc(0, "seed of the whole run", high=2**31 - 1)
+    seed: int = doc(0, "seed of the whole run", high=LARGEST_SEED)
     tasks: TasksConfig = TasksConfig()
     env: EnvConfig = EnvConfig()
     goals: GoalsConfig = GoalsConfig()

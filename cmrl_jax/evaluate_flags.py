@@ -13,15 +13,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from cmrl_jax.config import TASKS, Config, ConfigError, suggest
+from cmrl_jax.config import MOST_EPISODES, TASKS, Config, ConfigError, suggest
 from cmrl_jax.config_io import read_yaml, resolve
-from cmrl_jax.flags import Parser, counts, names, natural, parse, shown, writable
+from cmrl_jax.flags import (
+    adaptation,
+    goal_count,
+    list_of,
+    names,
+    natural,
+    parse,
+    parser_of,
+    seed,
+    shown,
+    steps,
+    writable,
+)
 from cmrl_jax.run_dir import find_run, holds_run
 from cmrl_jax.validate import check_goal_set
+from envs.command_line import brief, typed_path, what_is, whole
+from envs.goal_names import GOALS
 
 Z_SOURCES = ("posterior", "prior", "shuffled", "other", "text")
 DONATED = ("shuffled", "other")  # z from another lane's belief: lanes depend on one another
-MAX_GOALS = 50  # a goal set has so many a task
+# A draw is one of the numbers that name a lane's noise, in 32 bits (`evaluate.lane_names`), and
+# every lane keeps its text in memory.
+MOST_DRAWS = 10_000
 
 
 @dataclass(frozen=True)
@@ -50,7 +66,7 @@ class EvalOptions:
 
     k: tuple[int, ...] | None = None
     tasks: tuple[str, ...] | None = None
-    goals: int = MAX_GOALS
+    goals: int = GOALS
     goal_set: str = "heldout"
     draws: int = 1
     seed: int = 0
@@ -70,16 +86,22 @@ class EvalOptions:
 
 def _parser(command: str, description: str) -> argparse.ArgumentParser:
     """A parser with the flags of the protocol."""
-    parser = Parser(prog=f"python train.py {command}", description=description, allow_abbrev=False)
+    parser = parser_of(command, description)
     protocol = parser.add_argument_group("protocol")
     add = protocol.add_argument
-    add("--k", type=counts, metavar="0,1,2", help="adaptation episodes [eval.final_k of the run]")
+    add(
+        "--k",
+        type=adaptation,
+        metavar="0,1,2",
+        help="adaptation episodes [eval.final_k of the run]",
+    )
     add("--tasks", type=names, metavar="A,B", help="tasks to evaluate [those of the run]")
-    add("--goals", type=natural, default=50, metavar="N", help="goals a task, 1 to 50 [50]")
+    add("--goals", type=goal_count, default=GOALS, metavar="N", help="goals a task, 1 to 50 [50]")
     add("--goal-set", default="heldout", metavar="SET", help="train, heldout or fresh:<seed>")
-    add("--eval-seeds", type=natural, default=1, metavar="N", help="z draws a goal [1]")
-    add("--seed", type=natural, default=0, metavar="S", help="seed of the evaluation's draws [0]")
-    add("--horizon", type=natural, metavar="H", help="control steps an episode [env.horizon]")
+    draws = whole(1, MOST_DRAWS, "each is a lane of its own for every goal of every task")
+    add("--eval-seeds", type=draws, default=1, metavar="N", help="z draws a goal [1]")
+    add("--seed", type=seed, default=0, metavar="S", help="seed of the evaluation's draws [0]")
+    add("--horizon", type=steps, metavar="H", help="control steps an episode [env.horizon]")
     backends = ("mjx", "native", *(("metaworld",) if command == "eval" else ()))
     physics = f"{', '.join(backends)} [env.physics of the run]"
     add("--physics", metavar="P", choices=backends, help=physics)
@@ -87,7 +109,7 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
     add(
         "--policy", default=kinds[0], metavar="P", choices=kinds, help=f"or {kinds[1]} [{kinds[0]}]"
     )
-    add("--lanes", type=natural, metavar="N", help="parallel episodes in a batch [by device]")
+    add("--lanes", type=whole(1), metavar="N", help="parallel episodes in a batch [by device]")
     controls = parser.add_argument_group("controls: is z used, is the text?")
     add = controls.add_argument
     add(
@@ -113,7 +135,7 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         help="shuffled: another task's sentence; zero: a zero vector [none]",
     )
     add("--text", metavar="SENTENCE", help="one goal in your own words, for every task")
-    add("--weights", type=Path, metavar="DIR", help="the text encoder's weights, for --text")
+    add("--weights", type=typed_path, metavar="DIR", help="the text encoder's weights, for --text")
     add("--any-table", action="store_true", help="take sentences from another table than the run's")
     return parser
 
@@ -123,14 +145,15 @@ def eval_parser() -> argparse.ArgumentParser:
     text = "Evaluates a policy checkpoint: k adaptation episodes, then the one counted."
     parser = _parser("eval", text)
     add = parser.add_argument
-    add("--run", metavar="DIR", type=Path, required=True, help="run directory")
+    add("--run", metavar="DIR", type=typed_path, required=True, help="run directory")
     add("--checkpoint", type=natural, metavar="N", help="iteration of the checkpoint [the last]")
-    add("--json", type=Path, metavar="F", help="write the figures to this file")
-    add("--csv", type=Path, metavar="F", help="write one row a task, goal, draw and k")
+    add("--json", type=typed_path, metavar="F", help="write the figures to this file")
+    add("--csv", type=typed_path, metavar="F", help="write one row a task, goal, draw and k")
     own = parser.add_argument_group("Meta-World's own function, with --physics metaworld")
-    for name, default in (("adaptation", 10), ("evaluation", 3)):
+    for name, low, default in (("adaptation", 0, 10), ("evaluation", 1, 3)):
         text = f"its {name} episodes [{default}]"
-        own.add_argument(f"--{name}-episodes", type=natural, metavar="N", help=text)
+        kind = whole(low, MOST_EPISODES, "each is an episode of its own on every goal")
+        own.add_argument(f"--{name}-episodes", type=kind, metavar="N", help=text)
     return parser
 
 
@@ -141,8 +164,13 @@ def sweep_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--runs", metavar="GLOB", nargs="+", required=True, help="run directories, or patterns")
     add("--checkpoints", default="last", metavar="C", help="all, last, or iterations N,M [last]")
-    add("--json", type=Path, metavar="F", help="write the figures to this file")
-    add("--csv", type=Path, metavar="F", help="one row a cell; rows that are there are not run")
+    add("--json", type=typed_path, metavar="F", help="write the figures to this file")
+    add(
+        "--csv",
+        type=typed_path,
+        metavar="F",
+        help="one row a cell; rows that are there are not run",
+    )
     add(
         "--compare",
         type=natural,
@@ -160,14 +188,6 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
         ConfigError: a value out of range, an unknown name, or flags that contradict each other.
     """
     check_goal_set(args.goal_set, "--goal-set")
-    if not 1 <= args.goals <= MAX_GOALS:
-        raise ConfigError(f"--goals is {args.goals}", "give 1 to 50: a goal set has 50 a task")
-    for flag, value in (("horizon", args.horizon), ("lanes", args.lanes)):
-        if value == 0:
-            unit = {"horizon": "control step", "lanes": "lane"}[flag]
-            raise ConfigError(f"--{flag} is 0", f"give at least one {unit}")
-    if args.eval_seeds == 0:
-        raise ConfigError("--eval-seeds is 0", "give at least one draw a goal")
     for task in args.tasks or ():
         if task not in TASKS:
             cure = f"{suggest(task, TASKS)}valid: {', '.join(TASKS)}"
@@ -183,11 +203,20 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
         )
         if value != default
     ]
+    if args.text is not None and not args.text.strip():
+        cure = "write a sentence, or --text-control zero for a policy that is told nothing"
+        raise ConfigError("--text is empty", cure)
     if args.text is not None and changed:
         raise ConfigError(f"--text with {changed[0]}", "give one of the two: each names the text")
+    if args.weights is not None and what_is(args.weights) != "directory":
+        cause = f"--weights {brief(args.weights)} is no directory"
+        raise ConfigError(cause, "give the one that holds the text encoder's model")
     if args.physics == "metaworld" and args.z in DONATED:
         cause = f"--z {args.z} with --physics metaworld, where lanes know nothing of each other"
         raise ConfigError(cause, "use --z posterior, prior or text, or --physics native")
+    if args.physics == "metaworld" and args.lanes is not None:
+        cause = "--lanes with --physics metaworld, whose environments are stepped in tens"
+        raise ConfigError(cause, "leave it out, or use --physics native")
     own = {}
     for name in ("adaptation_episodes", "evaluation_episodes"):
         if (value := getattr(args, name, None)) is not None:
@@ -195,8 +224,6 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
             if args.physics != "metaworld":
                 raise ConfigError(f"{flag} without --physics metaworld", "leave it out")
             own[name] = value
-    if own.get("evaluation_episodes") == 0:
-        raise ConfigError("--evaluation-episodes is 0", "give at least one episode")
     return EvalOptions(
         **own,
         k=args.k,
@@ -234,6 +261,9 @@ def check_run(options: EvalOptions, run: Path) -> Config:
             raise ConfigError(f"--k {shown(k)} {told}", "give --k 0: only a latent z can adapt")
         if options.z != "posterior":
             raise ConfigError(f"--z {options.z} {told}", "leave --z out: the policy has no latent")
+        if options.adaptation_episodes not in (0, EvalOptions.adaptation_episodes):
+            cause = f"--adaptation-episodes {options.adaptation_episodes} {told}"
+            raise ConfigError(cause, "leave it out: only a latent z can adapt")
         for task in tasks:
             if task not in config.tasks.train:
                 cure = f"use its training tasks: {', '.join(config.tasks.train)}"
@@ -265,19 +295,22 @@ def evaluated_tasks(options: EvalOptions, config: Config) -> tuple[str, ...]:
 
 
 def find_runs(patterns: Sequence[str]) -> list[Path]:
-    """Run directories that match, each once, in the order of the patterns and then by name.
+    """Run directories that match, in the order of the patterns and then by name.
+
+    Each once, under the first name that was found for it.
 
     Raises:
         ConfigError: a pattern that matches no run.
     """
-    found: dict[Path, None] = {}
+    found: dict[Path, Path] = {}
     for pattern in patterns:
         runs = [Path(p) for p in sorted(glob.glob(pattern)) if holds_run(Path(p))]
         if not runs:
             cure = "give directories that hold a run, as --runs 'runs/ml4-*'"
-            raise ConfigError(f"--runs {pattern} matches no run", cure)
-        found |= dict.fromkeys(runs)
-    return list(found)
+            raise ConfigError(f"--runs {brief(pattern)} matches no run", cure)
+        for run in runs:
+            found.setdefault(run.resolve(), run)
+    return list(found.values())
 
 
 def checkpoint_choice(text: str) -> tuple[int, ...] | Literal["all", "last"]:
@@ -289,14 +322,17 @@ def checkpoint_choice(text: str) -> tuple[int, ...] | Literal["all", "last"]:
     if text in ("all", "last"):
         return text  # pyright: ignore[reportReturnType]
     try:
-        return counts(text)
-    except ValueError:
-        cause = f"--checkpoints is '{text}'"
-        raise ConfigError(cause, "give all, last, or iterations as 20,40") from None
+        chosen = list_of(natural)(text)
+    except argparse.ArgumentTypeError:
+        chosen = ()
+    if not chosen or len(set(chosen)) < len(chosen):
+        cure = "give all, last, or iterations as 20,40, each once"
+        raise ConfigError(f"--checkpoints is '{text}'", cure)
+    return chosen
 
 
 def run_eval(words: Sequence[str]) -> int:
-    """`train.py eval`; returns the exit code."""
+    """The command `eval`; returns the exit code."""
     args = parse(eval_parser(), words)
     options = options_of(args)
     check_run(options, args.run)
@@ -315,7 +351,7 @@ def run_eval(words: Sequence[str]) -> int:
 
 
 def run_sweep(words: Sequence[str]) -> int:
-    """`train.py sweep`; returns the exit code."""
+    """The command `sweep`; returns the exit code."""
     args = parse(sweep_parser(), words)
     options = options_of(args)
     if args.compare and options.z in DONATED:

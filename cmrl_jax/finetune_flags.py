@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
-from cmrl_jax.config import TASKS, Config, ConfigError, suggest
+from cmrl_jax.config import MOST_EPISODES, MOST_UPDATES, TASKS, Config, ConfigError, suggest
+from cmrl_jax.flags import goal_count, names, seed
 from cmrl_jax.validate import check_goal_set
+from envs.command_line import typed_path, whole
+from envs.goal_names import GOALS
 
 DESCRIPTION = "Adapts a trained policy to a task it never saw, with gradient steps on its own data."
 # What gradient steps may change; `posterior`: nothing, `scratch`: SAC that begins from nothing.
@@ -33,7 +35,7 @@ class FinetuneOptions:
     adapt: tuple[str, ...] = ADAPT
     episodes: int = 100
     updates: int = 1
-    goals: int = 50
+    goals: int = GOALS
     goal_set: str = "heldout"
     seed: int = 0
     physics: str | None = None
@@ -48,17 +50,21 @@ class FinetuneOptions:
 def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     """Adds the flags of `finetune`."""
     add = parser.add_argument
-    add("--run", metavar="DIR", type=Path, required=True, help="run directory, with its ckpt/")
+    add(
+        "--run", metavar="DIR", type=typed_path, required=True, help="run directory, with its ckpt/"
+    )
     add("--task", metavar="T", required=True, help="task to adapt to, as window-close")
-    add("--adapt", default=",".join(ADAPT), metavar="A,B", help=f"[{','.join(ADAPT)}]")
-    add("--episodes", type=int, default=100, metavar="N", help="episodes of own experience [100]")
-    add("--updates", type=int, default=1, metavar="N", help="gradient steps a control step [1]")
-    add("--goals", type=int, default=50, metavar="N", help="goals of a read-out, 1 to 50 [50]")
+    add("--adapt", type=names, default=ADAPT, metavar="A,B", help=f"[{','.join(ADAPT)}]")
+    episodes = whole(1, MOST_EPISODES, "all of them are kept in memory")
+    updates = whole(1, MOST_UPDATES, "all of a chunk's are one compiled loop")
+    add("--episodes", type=episodes, default=100, metavar="N", help="own experience [100]")
+    add("--updates", type=updates, default=1, metavar="N", help="gradient steps a control step [1]")
+    add("--goals", type=goal_count, default=GOALS, metavar="N", help="of a read-out, 1 to 50 [50]")
     add("--goal-set", default="heldout", metavar="SET", help="train, heldout or fresh:<seed>")
-    add("--seed", type=int, default=0, metavar="S", help="of episodes and read-outs [0]")
+    add("--seed", type=seed, default=0, metavar="S", help="of episodes and read-outs [0]")
     add("--physics", choices=("mjx", "native"), metavar="P", help="mjx, native [the run's own]")
-    add("--json", type=Path, metavar="F", help="write the figures to this file")
-    add("--figure", type=Path, metavar="F", help="draw the curves to this PNG")
+    add("--json", type=typed_path, metavar="F", help="write the figures to this file")
+    add("--figure", type=typed_path, metavar="F", help="draw the curves to this PNG")
     return parser
 
 
@@ -71,18 +77,14 @@ def options_of(args: argparse.Namespace) -> FinetuneOptions:
     if args.task not in TASKS:
         cure = f"{suggest(args.task, TASKS)}tasks: {', '.join(TASKS)}"
         raise ConfigError(f"unknown task '{args.task}'", cure)
-    adapt = tuple(word.strip() for word in args.adapt.split(",") if word.strip())
-    for word in adapt or ("",):
+    for word in args.adapt or ("",):
         if word not in ADAPT:
             raise ConfigError(f"--adapt '{word}' is no way to adapt", f"use: {', '.join(ADAPT)}")
-    for name, low in (("episodes", 1), ("updates", 1), ("goals", 1), ("seed", 0)):
-        if (value := getattr(args, name)) < low:
-            raise ConfigError(f"--{name} is {value}", f"give {low} or more")
-    if args.goals > 50:
-        raise ConfigError(f"--goals is {args.goals}", "give 1 to 50: a goal set has 50 a task")
+        if args.adapt.count(word) > 1:
+            raise ConfigError(f"--adapt names {word} twice", "name each way once")
     check_goal_set(args.goal_set, "--goal-set")
-    fields = ("task", "episodes", "updates", "goals", "goal_set", "seed", "physics")
-    return FinetuneOptions(adapt=adapt, **{name: getattr(args, name) for name in fields})
+    fields = ("task", "adapt", "episodes", "updates", "goals", "goal_set", "seed", "physics")
+    return FinetuneOptions(**{name: getattr(args, name) for name in fields})
 
 
 def check_run(config: Config, options: FinetuneOptions) -> None:

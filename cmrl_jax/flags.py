@@ -1,28 +1,31 @@
-"""Command-line parsing shared by all commands: two-line errors, kinds of values, output files.
+"""Command-line parsing shared by all commands: kinds of values, and what is no mistake of ours.
 
-Imports neither jax nor numpy, so that `--help` and a user's mistake are answered at once.
+Every flag of every command takes its kind from here, so that a number has the same bounds and a
+path is judged in the same way wherever it stands. Imports neither jax nor numpy, so that `--help`
+and a user's mistake are answered at once.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from cmrl_jax.config import ConfigError, suggest
+from cmrl_jax.commands import program
+from cmrl_jax.config import MOST_EPISODES, MOST_STEPS, ConfigError, call_envs, suggest
+from envs.command_line import Parser, check_writable, whole
+from envs.goal_names import GOALS, LARGEST_SEED
 
 
-class Parser(argparse.ArgumentParser):
-    """argparse with our two-line errors in place of its usage text."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(message, f"see: {self.prog} --help")
+def parser_of(command: str, description: str) -> Parser:
+    """An empty parser of a command, which says how this program was started."""
+    return Parser(prog=f"{program()} {command}", description=description, allow_abbrev=False)
 
 
 def parse(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
     """Parses all of `words`; the first that means nothing is an error with a suggestion."""
-    args, unknown = parser.parse_known_args(words)
+    args, unknown = call_envs(lambda: parser.parse_known_args(words))
     if unknown:
         word = unknown[0].partition("=")[0]
         flags = [flag for flag in parser._option_string_actions if flag.startswith("--")]
@@ -31,25 +34,23 @@ def parse(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Nam
     return args
 
 
-def natural(text: str) -> int:
-    """A whole number from 0, as an argparse type."""
-    number = int(text)
-    if number < 0:
-        raise ValueError(text)
-    return number
+def list_of(kind: Callable[[str], int]) -> Callable[[str], tuple[int, ...]]:
+    """An argparse type: numbers of a kind, comma separated."""
+    return lambda text: tuple(kind(item) for item in text.split(","))
 
 
-def counts(text: str) -> tuple[int, ...]:
-    """Whole numbers from 0, comma separated, as an argparse type."""
-    return tuple(natural(item) for item in text.split(","))
+natural = whole()
+seed = whole(0, LARGEST_SEED)
+goal_count = whole(1, GOALS, f"a goal set has {GOALS} goals a task")
+goal_index = whole(0, GOALS - 1, f"a goal set has {GOALS} goals a task")
+steps = whole(1, MOST_STEPS, "control steps of an episode")
+episodes = whole(0, MOST_EPISODES, "each is played from its first step to its last")
+adaptation = list_of(episodes)
 
 
 def names(text: str) -> tuple[str, ...]:
     """Words, comma separated, as an argparse type."""
     return tuple(item.strip() for item in text.split(",") if item.strip())
-
-
-natural.__name__, counts.__name__, names.__name__ = "whole number", "list of counts", "list"
 
 
 def shown(value: Any) -> str:
@@ -65,14 +66,5 @@ def writable(path: Path | None, flag: str = "--json") -> None:
     Raises:
         ConfigError: the file cannot be written.
     """
-    if path is None:
-        return
-    try:
-        existed = path.exists()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("a", encoding="utf-8").close()
-        if not existed:
-            path.unlink()
-    except OSError as error:
-        cause = f"cannot write {path}: {error.strerror}"
-        raise ConfigError(cause, f"give {flag} a file you may write to") from error
+    if path is not None:
+        call_envs(lambda: check_writable(path, flag))

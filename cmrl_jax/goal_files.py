@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cmrl_jax.config import GOAL_ABLATIONS, TEXT_ENCODERS, ConfigError
+from cmrl_jax.commands import command
+from cmrl_jax.config import GOAL_ABLATIONS, TEXT_ENCODERS, ConfigError, call_envs
 from cmrl_jax.validate import check_goal_table
+from envs.command_line import brief, what_is
 
 DATA = Path(__file__).parent / "data"
 PROMPTS_FILE = DATA / "goal_prompts.yaml"
 DEFAULT_TABLE = TEXT_ENCODERS[0]
-BUILD = "python train.py goals"
 
 
 def table_path(encoder: str) -> Path:
@@ -26,10 +27,13 @@ def find_table(table: str) -> Path:
     """
     check_goal_table(table)
     if table.endswith(".npz"):
-        path, cure = Path(table), f"build it: {BUILD} --weights DIR --out {table}"
+        path, build = Path(table), command("goals", "--weights", "DIR", "--out", table)
     else:
         encoder = DEFAULT_TABLE if table in GOAL_ABLATIONS else table
-        path, cure = table_path(encoder), f"build it: {BUILD} --encoder {encoder}"
-    if not path.is_file():
-        raise ConfigError(f"the goal table {table} is not there: {path} does not exist", cure)
+        path, build = table_path(encoder), command("goals", "--encoder", encoder)
+    lies_there = call_envs(lambda: what_is(path))
+    if lies_there != "file":
+        state = "is a directory" if lies_there == "directory" else "does not exist"
+        cause = f"the goal table {brief(table)} is not there: {brief(path)} {state}"
+        raise ConfigError(cause, f"build it: {build}")
     return path

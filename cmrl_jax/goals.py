@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cmrl_jax.commands import command
 from cmrl_jax.config import GOAL_ABLATIONS, TASKS, ConfigError
-from cmrl_jax.goal_files import BUILD, find_table
+from cmrl_jax.goal_files import find_table
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ def read_table(path: Path) -> GoalTable:
     Raises:
         ConfigError: missing, corrupt or inconsistent file.
     """
-    cure = f"restore the file, or build it: {BUILD} --help"
+    cure = f"restore the file, or build it: {command('goals', '--help')}"
     try:
         content = path.read_bytes()
         with np.load(io.BytesIO(content), allow_pickle=False) as data:

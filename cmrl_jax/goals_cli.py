@@ -1,9 +1,11 @@
-"""`train.py goals`: its flags, and what they do. Imports what it needs when it runs."""
+"""The command `goals`: its flags, and what they do. Imports what it needs when it runs."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+
+from cmrl_jax.flags import writable
+from envs.command_line import typed_path
 
 DESCRIPTION = (
     "Makes the table of text vectors that `goals.table` names, from the sentences in "
@@ -22,14 +24,19 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--weights",
-        type=Path,
+        type=typed_path,
         metavar="DIR",
         help="directory of the model [the pip package (minilm), the hub or its cache (clip)]",
     )
-    add("--out", type=Path, metavar="F", help="table to write or to look at [the packaged one]")
+    add(
+        "--out",
+        type=typed_path,
+        metavar="F",
+        help="table to write or to look at [the packaged one]",
+    )
     add("--force", action="store_true", help="replace a table of another encoder")
     add("--show", action="store_true", help="print the cosines between the tasks")
-    add("--figure", type=Path, metavar="F.png", help="draw the cosines and a PCA (extra viz)")
+    add("--figure", type=typed_path, metavar="F.png", help="draw the cosines and a PCA (extra viz)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,7 +48,12 @@ def run(args: argparse.Namespace) -> int:
     from cmrl_jax import goal_builder, goals
 
     is_look = args.show or args.figure is not None
+    if args.figure is not None:
+        from cmrl_jax import plots
+
+        plots.check_figure(args.figure)
     if not is_look or args.weights or args.force:
+        writable(args.out, "--out")  # before the sentences are encoded
         path = goal_builder.build(args.encoder, args.weights, args.out, args.force)
         print(f"{path}: sha256 {goal_builder.file_sha256(path)}")
     if not is_look:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 from cmrl_jax.config import ConfigError
 from cmrl_jax.run_dir import find_run
+from envs.command_line import typed_path
 
 DESCRIPTION = (
     "Draws success, returns, adaptation, routing and latents of runs; seeds of one run as a band."
@@ -18,18 +20,32 @@ def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument(
         "--run",
         metavar="DIR",
-        type=Path,
+        type=typed_path,
         required=True,
         action="append",
         help="run directory, again for more runs; DIR-seed0, DIR-seed1 are one band",
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="directory [plots/ of the first]")
+    parser.add_argument(
+        "--out", metavar="DIR", type=typed_path, help="directory [plots/ of the first]"
+    )
     parser.add_argument(
         "--inspect",
         action="store_true",
         help="first roll out each run's policy and write DIR/inspection.json, for routing and z",
     )
     return parser
+
+
+def check_runs(runs: Sequence[Path]) -> None:
+    """Whether each is a run, and another one than those before it: a mean counts each once.
+
+    Raises:
+        ConfigError: one is not.
+    """
+    places = [find_run(run).resolve() for run in runs]
+    for run, place in zip(runs, places, strict=True):
+        if places.count(place) > 1:
+            raise ConfigError(f"--run {run} stands there twice", "name each run once")
 
 
 def check_inspectable(run: Path) -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import os
-from pathlib import Path
 from typing import Any
 
-from cmrl_jax.config import ConfigError
+from cmrl_jax.config import ConfigError, call_envs
 from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.flags import episodes, goal_index, natural, seed, steps
 from cmrl_jax.run_dir import find_run
 from cmrl_jax.validate import check_goal_set
+from envs.command_line import make_directory, typed_path, whole
 
 DESCRIPTION = (
     "Films one adaptation run per task in Meta-World's own scene: k exploration episodes, then the "
@@ -23,15 +23,15 @@ _PACKAGES = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
 def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     """Adds the flags of `render`."""
     add = parser.add_argument
-    add("--run", metavar="DIR", type=Path, required=True, help="run directory")
-    add("--k", type=int, metavar="N", help="exploration episodes [1; 0 without a latent z]")
-    add("--goal", type=int, default=0, metavar="N", help="goal of the set, 0 to 49 [0]")
+    add("--run", metavar="DIR", type=typed_path, required=True, help="run directory")
+    add("--k", type=episodes, metavar="N", help="exploration episodes [1; 0 without a latent z]")
+    add("--goal", type=goal_index, default=0, metavar="N", help="goal of the set, 0 to 49 [0]")
     add("--goal-set", default="heldout", metavar="SET", help="train, heldout or fresh:<seed>")
-    add("--seed", type=int, default=0, metavar="S", help="seed of the z draws [0]")
-    add("--horizon", type=int, metavar="H", help="control steps an episode [env.horizon]")
-    add("--checkpoint", type=int, metavar="N", help="iteration of the checkpoint [the last]")
-    add("--every", type=int, default=4, metavar="N", help="control steps a video frame [4]")
-    add("--out", type=Path, metavar="DIR", help="where the files go [RUN/render]")
+    add("--seed", type=seed, default=0, metavar="S", help="seed of the z draws [0]")
+    add("--horizon", type=steps, metavar="H", help="control steps an episode [env.horizon]")
+    add("--checkpoint", type=natural, metavar="N", help="iteration of the checkpoint [the last]")
+    add("--every", type=whole(1), default=4, metavar="N", help="control steps a video frame [4]")
+    add("--out", type=typed_path, metavar="DIR", help="where the files go [RUN/render]")
     return parser
 
 
@@ -39,16 +39,9 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     """The arguments of `render.render_run`; makes the output directory.
 
     Raises:
-        ConfigError: a value out of range, no run, a package that is missing, or a directory that
-            cannot be written.
+        ConfigError: no goal set or run, a package that is missing, or a directory that cannot be
+            written.
     """
-    least_of = {"k": 0, "goal": 0, "seed": 0, "horizon": 1, "checkpoint": 0, "every": 1}
-    for flag, least in least_of.items():
-        value = getattr(args, flag)
-        if value is not None and value < least:
-            raise ConfigError(f"--{flag} is {value}", f"give {least} or more")
-    if args.goal > 49:
-        raise ConfigError(f"--goal is {args.goal}", "give 0 to 49: a goal set has 50 a task")
     check_goal_set(args.goal_set, "--goal-set")
     run = find_run(args.run)
     config = resolve(*read_yaml(run / "config.yaml"))
@@ -61,13 +54,7 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
             cause = f"render needs the package {package}, which is not installed"
             raise ConfigError(cause, "pip install 'cmrl-jax[viz]'")
     out = args.out or run / "render"
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        reason = None if os.access(out, os.W_OK) else "permission denied"
-    except OSError as error:
-        reason = error.strerror
-    if reason:
-        raise ConfigError(f"cannot write to {out}: {reason}", "give --out another directory")
+    call_envs(lambda: make_directory(out, "--out"))
     return {
         "run": run,
         "k": args.k if args.k is not None else int(has_latent),

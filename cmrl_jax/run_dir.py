@@ -16,7 +16,9 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-from cmrl_jax.config import ConfigError
+from cmrl_jax.commands import command, quoted
+from cmrl_jax.config import ConfigError, call_envs
+from envs.command_line import brief, what_is
 
 RUN_FILES = ("config.yaml", "metrics.csv", "ckpt")
 ROOT = Path("runs")
@@ -27,8 +29,8 @@ _TIME = r"\d{8}-\d{6}(-\d+)?"
 
 
 def holds_run(path: Path) -> bool:
-    """Whether a run has begun to write into `path`."""
-    return any((path / name).exists() for name in RUN_FILES)
+    """Whether a run has begun to write into `path`; no, where that cannot be looked at."""
+    return any(os.path.exists(path / name) for name in RUN_FILES)
 
 
 def config_stem(path: Path) -> str:
@@ -59,14 +61,16 @@ def find_run(path: Path) -> Path:
     """`path`, if it holds a run.
 
     Raises:
-        ConfigError: naming the runs that are there.
+        ConfigError: naming the runs that are there, or why nothing can be said of `path`.
     """
+    call_envs(lambda: what_is(path / RUN_FILES[0]))
     if holds_run(path):
         return path
-    known = [str(p) for p in sorted(ROOT.glob("*")) if holds_run(p)][-5:]
+    known = [quoted(p) for p in sorted(ROOT.glob("*")) if holds_run(p)][-5:]
     state = "holds no run" if path.is_dir() else "does not exist"
-    cure = f"give --run one of: {', '.join(known)}" if known else "train first: make train"
-    raise ConfigError(f"run directory {path} {state}", cure)
+    train = f"train first: {command('--config', 'ml4.yaml')}"
+    cure = f"give --run one of: {', '.join(known)}" if known else train
+    raise ConfigError(f"run directory {brief(path)} {state}", cure)
 
 
 def resumed_run(stem: str, run: Path | None) -> Path:
@@ -96,7 +100,7 @@ def new_run(stem: str, run: Path | None, now: datetime.datetime | None = None) -
         run, copy = base, 1
         while run.exists():
             run, copy = base.with_name(f"{base.name}-{copy}"), copy + 1
-    elif holds_run(run):
+    elif call_envs(lambda: what_is(run / RUN_FILES[0])) and holds_run(run):
         cause = f"run directory {run} already holds a run"
         raise ConfigError(cause, "add --resume to go on with it, or give another --run DIR")
     try:
@@ -110,7 +114,7 @@ def cannot_write(run: Path, error: OSError) -> ConfigError:
     """What to tell a user whose run directory refuses a write."""
     cause = f"cannot write to run directory {run}: {error.strerror}"
     if error.errno in DISK_FULL:
-        resume = f"python train.py --run {run} --resume"
+        resume = command("--run", run, "--resume")
         return ConfigError(cause, f"make room, then go on from the last checkpoint: {resume}")
     return ConfigError(cause, "give a directory you may write to: --run DIR")
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmrl_jax.checkpoint import policy_store
-from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config import Config, call_envs
 from cmrl_jax.controls import text_per_goal
 from cmrl_jax.episode import PolicyParams
 from cmrl_jax.evaluate import Evaluator, Trial
@@ -130,14 +130,3 @@ def load_policy(
 def policy_params(state: TrainState) -> PolicyParams:
     """The part of the learner's state that acts."""
     return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
-
-
-def call_envs(build):
-    """Calls into `envs`, whose ValueErrors carry cause and cure on two lines."""
-    try:
-        return build()
-    except ValueError as error:
-        cause, _, cure = str(error).partition("\n")
-        if not cure:
-            raise
-        raise ConfigError(cause, cure) from error

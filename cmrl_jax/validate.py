@@ -10,6 +10,7 @@ import math
 
 from cmrl_jax.config import (
     GOAL_ABLATIONS,
+    LARGEST_RING,
     TASKS,
     TEXT_ENCODERS,
     Config,
@@ -19,6 +20,8 @@ from cmrl_jax.config import (
     leaves,
     suggest,
 )
+from envs.command_line import LARGEST
+from envs.goal_names import seed_of
 
 # Options of the schema whose code is not there yet: refused by name, so that nobody trains for an
 # hour on a switch that does nothing.
@@ -64,6 +67,8 @@ def _check_bounds(config: Config) -> None:
                 continue
             lower = f"above {above}" if above is not None else f"at least {low}"
             inside = number > above if above is not None else number >= low
+            if high is None and isinstance(number, int):
+                high = LARGEST
             inside = inside and (high is None or number <= high)
             upper = "" if high is None else f" and at most {high}"
             _require(inside, f"{name} is {number}", f"give {name} a value {lower}{upper}")
@@ -150,6 +155,10 @@ def _check_sizes(config: Config) -> None:
     _require(
         capacity >= episode, cause, f"set train.capacity: {episode} or a larger multiple of it"
     )
+    ring = collect.context_episodes * episode
+    cause = f"collect.context_episodes {collect.context_episodes} of {episode} steps: {ring} slots"
+    cure = f"set collect.context_episodes to at most {LARGEST_RING // episode}"
+    _require(ring <= LARGEST_RING, cause, cure)
     cause = f"train.capacity {capacity} is not a multiple of the {lanes} lanes of a task"
     _require(capacity % lanes == 0, cause, f"set train.capacity: {-(-capacity // lanes) * lanes}")
     cause = "train.env_steps and train.minutes are both 0: the run would never end"
@@ -186,14 +195,12 @@ def check_devices(config: Config, devices: int) -> None:
 
 
 def check_goal_set(name: str, key: str) -> None:
-    """Raises ConfigError unless `name` is train, heldout or fresh:<seed>."""
-    kind, colon, seed = name.partition(":")
-    fresh = kind == "fresh" and bool(colon) and seed.isascii() and seed.isdigit()
-    _require(
-        name in ("train", "heldout") or fresh,
-        f"{key} '{name}' is no goal set",
-        f"{suggest(name, ['train', 'heldout'])}valid: train, heldout, fresh:<seed>, as fresh:7",
-    )
+    """Raises ConfigError unless `name` is the one name of a goal set; see `goal_names.seed_of`."""
+    try:
+        seed_of(name)
+    except ValueError as error:
+        cause, cure = str(error).split("\n")
+        raise ConfigError(f"{key} {cause}", cure) from error
 
 
 def _check_eval(config: Config) -> None:

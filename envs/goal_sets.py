@@ -14,7 +14,6 @@ NOTES
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import os
 import pickle
@@ -27,11 +26,10 @@ from typing import Any
 
 import numpy as np
 
+from envs.command_line import Parser, check_writable, run, typed_path
+from envs.goal_names import GOALS, SEEDS, seed_of
+
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
-GOALS = 50
-"""Goals of one task in a set: what Meta-World's task maker draws."""
-SEEDS = {"train": 0, "heldout": 1000}
-"""Seed of each packaged set."""
 
 RESET_BOX = {
     "drawer-open": ((-0.1, 0.9, 0.0), (0.1, 0.9, 0.0)),
@@ -61,26 +59,18 @@ def load_goal_set(
         float64 (task, 50, 3): fixture positions in metres, in the order Meta-World drew them.
 
     Raises:
-        ValueError: unknown set or task, unreadable file, metaworld missing for a fresh set. The
-            message is two lines: cause, cure.
+        ValueError: unknown set or task, a set under another than its one name, unreadable file,
+            metaworld missing for a fresh set. The message is two lines: cause, cure.
     """
     for task in tasks:
         if task not in TASKS:
-            raise ValueError(f"unknown task {task!r}{_meant(task, TASKS)}\nvalid: {_list(TASKS)}")
+            close = difflib.get_close_matches(task, TASKS, n=1)
+            meant = f"; did you mean {close[0]!r}?" if close else ""
+            raise ValueError(f"unknown task {task!r}{meant}\nvalid: {', '.join(TASKS)}")
+    seed = seed_of(name)
     if name in SEEDS:
         packaged = _read(_PACKAGED, "python -m envs.goal_sets writes the packaged file again")
         return np.stack([_goals(packaged, f"{name}/{task}", _PACKAGED) for task in tasks])
-
-    kind, _, seed_text = name.partition(":")
-    if kind != "fresh" or not seed_text.isascii() or not seed_text.isdigit():
-        meant = _meant(name, (*SEEDS, "fresh:0"))
-        raise ValueError(
-            f"unknown goal set {name!r}{meant}\n"
-            f"valid: {_list(SEEDS)}, fresh:<seed> with a whole number, for example fresh:7"
-        )
-    seed = int(seed_text)
-    if seed >= 2**32:
-        raise ValueError(f"the seed of goal set {name!r} is too large\nuse one below 2**32")
     return np.stack([_fresh(task, seed, _cache_directory(cache)) for task in tasks])
 
 
@@ -89,7 +79,8 @@ def draw_goals(task: str, seed: int) -> np.ndarray:
 
     Args:
         task: one of `TASKS`.
-        seed: the maker's seed, in [0, 2**32). The global numpy stream is left as it was.
+        seed: the maker's seed, up to `goal_names.LARGEST_SEED`. The global numpy stream is left as
+            it was.
 
     Returns:
         float64 (50, 3): fixture positions in metres.
@@ -121,9 +112,11 @@ def write_packaged(path: Path = _PACKAGED) -> None:
     _write(path, {f"{n}/{t}": draw_goals(t, seed) for n, seed in SEEDS.items() for t in TASKS})
 
 
-def _fresh(task: str, seed: int, cache: Path) -> np.ndarray:
+def _fresh(task: str, seed: int, cache: Path | None) -> np.ndarray:
+    if cache is None:
+        return draw_goals(task, seed)
     path = cache / "goals" / f"{task}-{seed}.npz"
-    if not path.is_file():
+    if not os.path.isfile(path):  # nor is one that cannot be looked at
         goals = draw_goals(task, seed)
         try:
             _write(path, {"goals": goals})
@@ -133,8 +126,12 @@ def _fresh(task: str, seed: int, cache: Path) -> np.ndarray:
     return _goals(_read(path, f"delete {path} and start again"), "goals", path)
 
 
-def _cache_directory(cache: str | Path | None) -> Path:
-    return Path(cache or os.environ.get(_CACHE_VARIABLE) or "~/.cache/cmrl_jax").expanduser()
+def _cache_directory(cache: str | Path | None) -> Path | None:
+    directory = Path(cache or os.environ.get(_CACHE_VARIABLE) or "~/.cache/cmrl_jax")
+    try:
+        return directory.expanduser()
+    except RuntimeError:  # a user without a home has no cache
+        return None
 
 
 def _read(path: Path, cure: str) -> dict[str, np.ndarray]:
@@ -171,24 +168,24 @@ def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
     os.replace(part.name, path)
 
 
-def _meant(got: str, valid: Sequence[str]) -> str:
-    close = difflib.get_close_matches(got, valid, n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Writes the packaged goal sets and prints the range of each; returns the exit code."""
+    return run(lambda: _write_and_show(argv))
 
 
-def _list(names: Any) -> str:
-    return ", ".join(names)
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Writes the packaged goal sets and prints the range of each."""
-    parser = argparse.ArgumentParser(prog="python -m envs.goal_sets", description=main.__doc__)
-    parser.add_argument("--out", type=Path, default=_PACKAGED, help="file to write")
+def _write_and_show(argv: Sequence[str] | None) -> None:
+    parser = Parser(
+        prog="python -m envs.goal_sets",
+        description="Writes the packaged goal sets and prints the range of each.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--out", type=typed_path, default=_PACKAGED, metavar="F", help="[packaged]")
     out = parser.parse_args(argv).out
+    check_writable(out, "--out")
     write_packaged(out)
     for key, goals in _read(out, "run the command again").items():
         print(f"{key:22s} {len(goals)} goals from {goals.min(0)} to {goals.max(0)} m")
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

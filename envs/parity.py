@@ -10,39 +10,35 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
-import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from envs.goal_sets import GOALS, load_goal_set
+from envs.command_line import Parser, check_writable, run, typed_path, whole
+from envs.goal_names import GOALS, LARGEST_SEED, name_of
+from envs.goal_sets import load_goal_set
 
 DEFAULT_NOISE = 0.3  # of the second closed-loop run when all parts are measured
 STATE_GOALS = 10  # parts 1 to 3 take their states from at most so many goals a task
 MAX_HORIZON = 500  # Meta-World's own limit
-_LARGEST_SEED = 2**32 - 1
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message}\nsee: python -m envs.parity --help")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="python -m envs.parity",
         description="Measures this port of Meta-World's ML4 tasks against Meta-World itself.",
         allow_abbrev=False,
     )
     parser.add_argument("--policies", action="store_true", help="part 4 only: scripted policies")
     parser.add_argument("--physics", default="mjx", metavar="mjx|native", help="backend [mjx]")
-    parser.add_argument("--goals", type=int, default=10, metavar="N", help="goals a task [10]")
+    goals = whole(1, GOALS, f"a goal set has {GOALS} goals a task")
+    parser.add_argument("--goals", type=goals, default=10, metavar="N", help="goals a task [10]")
     parser.add_argument(
         "--seed",
-        type=int,
+        type=whole(0, LARGEST_SEED),
         metavar="S",
-        help="of the noise [0]; without --goal-set also of the goals: fresh:S",
+        help="of the noise [0]; without --goal-set also of the goals: fresh:S, or the packaged "
+        "set of that seed (0: train, 1000: heldout)",
     )
     parser.add_argument("--goal-set", metavar="NAME", help="train, heldout or fresh:S [heldout]")
     parser.add_argument(
@@ -51,10 +47,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="X",
         help=f"action noise of part 4 [0; all parts: 0 and {DEFAULT_NOISE}]",
     )
+    steps = whole(1, MAX_HORIZON, f"Meta-World's episodes end at {MAX_HORIZON} steps")
     parser.add_argument(
-        "--horizon", type=int, default=200, metavar="H", help="control steps an episode [200]"
+        "--horizon", type=steps, default=200, metavar="H", help="control steps an episode [200]"
     )
-    parser.add_argument("--json", type=Path, metavar="F", help="write the figures there, too")
+    parser.add_argument("--json", type=typed_path, metavar="F", help="write the figures there, too")
     return parser
 
 
@@ -62,20 +59,10 @@ def _check(args: argparse.Namespace) -> None:
     """Raises ValueError (cause, cure) for what the parser cannot see."""
     if args.physics not in ("mjx", "native"):
         raise ValueError(f"unknown physics backend '{args.physics}'\nuse --physics mjx or native")
-    if not 1 <= args.goals <= GOALS:
-        raise ValueError(f"a goal set holds {GOALS} goals a task, --goals {args.goals} is none\n"
-                         f"use 1 to {GOALS}")  # fmt: skip
-    if not 1 <= args.horizon <= MAX_HORIZON:
-        raise ValueError(
-            f"Meta-World's episodes end at {MAX_HORIZON} steps, --horizon {args.horizon} is none\n"
-            f"use 1 to {MAX_HORIZON}"
-        )
     if args.noise is not None and not 0 <= args.noise < float("inf"):
         raise ValueError(f"--noise {args.noise} is no standard deviation\nuse 0 or more, as 0.3")
-    if args.seed is not None and not 0 <= args.seed <= _LARGEST_SEED:
-        raise ValueError(f"--seed {args.seed} is out of range\nuse 0 to {_LARGEST_SEED}")
-    if args.json and not args.json.parent.is_dir():
-        raise ValueError(f"{args.json.parent} is not a directory\ncreate it or change --json")
+    if args.json:
+        check_writable(args.json, "--json")
 
 
 def measure(
@@ -144,10 +131,10 @@ def measure(
     }
 
 
-def _run(words: Sequence[str]) -> None:
+def _measure_and_report(words: Sequence[str] | None) -> None:
     args = _parser().parse_args(words)
     _check(args)
-    goal_set = args.goal_set or ("heldout" if args.seed is None else f"fresh:{args.seed}")
+    goal_set = args.goal_set or ("heldout" if args.seed is None else name_of(args.seed))
     noises = [args.noise or 0.0]
     if not args.policies:
         noises.append(DEFAULT_NOISE if noises[0] == 0 else 0.0)
@@ -165,15 +152,7 @@ def _run(words: Sequence[str]) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the measurement; a mistake of the user is two lines (cause, cure) and exit code 2."""
-    try:
-        _run(sys.argv[1:] if argv is None else argv)
-    except ValueError as error:
-        cause, _, cure = str(error).partition("\n")
-        if not cure:  # not one of ours
-            raise
-        print(f"error: {cause}\nfix: {cure}", file=sys.stderr)
-        return 2
-    return 0
+    return run(lambda: _measure_and_report(argv))
 
 
 if __name__ == "__main__":

@@ -6,14 +6,12 @@ fixture has made half of its way, so that the hand is at the handle.
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from envs.command_line import Parser, make_directory, run, typed_path
 from envs.render import choose_gl
 
 SCENES = ("drawer", "window")
@@ -95,40 +93,27 @@ def half_way(task: str) -> tuple[int, np.ndarray, np.ndarray]:
     return step, rollout.qpos[step], placement
 
 
-def _make_directory(path: Path) -> None:
-    """Makes sure that there is a directory to write to; else ValueError (cause, cure)."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        reason = None if os.access(path, os.W_OK) else "permission denied"
-    except OSError as error:
-        reason = error.strerror
-    if reason:
-        raise ValueError(f"cannot write to {path}: {reason}\ngive --out another directory")
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Writes drawer.png and window.png; a mistake of the user is two lines and exit code 2."""
-    parser = argparse.ArgumentParser(
+    return run(lambda: _write_pictures(argv))
+
+
+def _write_pictures(argv: Sequence[str] | None) -> None:
+    parser = Parser(
         prog="python -m envs.picture",
         description="Draws both scenes as simulated by the mjx backend beside Meta-World's own.",
         allow_abbrev=False,
     )
     default = Path("envs/pictures")
-    parser.add_argument("--out", type=Path, default=default, metavar="DIR", help=f"[{default}]")
-    out = parser.parse_args(sys.argv[1:] if argv is None else argv).out
-    try:
-        choose_gl()
-        _make_directory(out)
-        for scene in SCENES:
-            write_picture(scene, out / f"{scene}.png")
-            print(out / f"{scene}.png")
-    except ValueError as error:
-        cause, _, cure = str(error).partition("\n")
-        if not cure:  # not one of ours
-            raise
-        print(f"error: {cause}\nfix: {cure}", file=sys.stderr)
-        return 2
-    return 0
+    parser.add_argument(
+        "--out", type=typed_path, default=default, metavar="DIR", help=f"[{default}]"
+    )
+    out = parser.parse_args(argv).out
+    choose_gl()
+    make_directory(out, "--out")
+    for scene in SCENES:
+        write_picture(scene, out / f"{scene}.png")
+        print(out / f"{scene}.png")
 
 
 if __name__ == "__main__":

@@ -62,6 +62,14 @@ def test_policies_only_with_noise_and_seed(compiled, tmp_path, capsys, monkeypat
     assert "1. " not in capsys.readouterr().out.split("\n4. ")[0]
 
 
+@pytest.mark.parametrize(("seed", "name"), [(0, "train"), (1000, "heldout")])
+def test_a_packaged_sets_seed_is_called_by_its_name(monkeypatch, seed, name):
+    measured = lambda physics, goal_set, *rest: pytest.fail(f"measured {goal_set}")
+    monkeypatch.setattr(parity, "measure", measured)
+    with pytest.raises(pytest.fail.Exception, match=f"^measured {name}$"):
+        parity.main(["--seed", str(seed)])
+
+
 def test_both_sides_get_the_same_noise(port):
     goals = np.zeros((4, GOALS_A_TASK, 3))
     noise = parity_parts.draw_noise(goals, 30, 0.3, seed=5)
@@ -93,16 +101,17 @@ def test_tables_align_and_json_has_no_nan():
 @pytest.mark.parametrize(
     ("words", "cause", "cure"),
     [
-        (["--goals", "51"], "a goal set holds 50 goals a task, --goals 51 is none", "use 1 to 50"),
-        (["--goals", "0"], "--goals 0 is none", "use 1 to 50"),
-        (["--goals", "few"], "argument --goals: invalid int value: 'few'", "--help"),
+        (["--goals", "51"], "51 is no whole number from 1 to 50", "50 goals a task"),
+        (["--goals", "0"], "--goals: 0 is no whole number from 1 to 50", "a task"),
+        (["--goals", "few"], "argument --goals: few is no whole number", "in this range"),
         (["--polices"], "unrecognized arguments: --polices", "--help"),
         (["--physics", "warp"], "unknown physics backend 'warp'", "mjx or native"),
-        (["--horizon", "501"], "--horizon 501 is none", "use 1 to 500"),
+        (["--horizon", "501"], "501 is no whole number from 1 to 500", "end at 500"),
         (["--noise", "-1"], "--noise -1.0 is no standard deviation", "0.3"),
-        (["--seed", "-1"], "--seed -1 is out of range", "use 0 to"),
-        (["--goal-set", "hedlout"], "unknown goal set 'hedlout'", "valid: train, heldout"),
-        (["--json", "/no/such/folder/x.json"], "/no/such/folder is not a directory", "--json"),
+        (["--seed", "-1"], "--seed: -1 is no whole number from 0", "in this range"),
+        (["--seed", "2147483648"], "from 0 to 2147483647", "in this range"),
+        (["--goal-set", "hedlout"], "'hedlout' is no goal set", "did you mean 'heldout'"),
+        (["--json", "/dev/null/x.json"], "cannot write /dev/null/x.json", "give --json"),
     ],
 )
 def test_mistakes_are_two_lines_and_exit_code_2(words, cause, cure, capsys):

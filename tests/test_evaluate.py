@@ -9,9 +9,11 @@ import pytest
 from policy_fixtures import HORIZON, MovingEnv, random_policy, small_config
 
 from cmrl_jax.controls import donors
-from cmrl_jax.evaluate import Evaluator
+from cmrl_jax.evaluate import Evaluator, Trial, lane_names
+from cmrl_jax.evaluate_flags import MOST_DRAWS
 from cmrl_jax.replay import Transition
 from cmrl_jax.session import Session
+from envs.goal_names import GOALS
 from envs.tasks import TASKS, task_id
 
 LANES = 5  # of a batch: fewer than any evaluation here has, and no divisor of them
@@ -275,3 +277,9 @@ def test_a_fault_while_adapting_counts_for_what_was_adapted(evaluator, policy, t
     scores = evaluator.run([policy], trial, (0, 1, 2), seed=3)
     assert [int(scores[k].faults.max()) for k in (0, 1, 2)] == [0, 1, 1]
     assert [int(scores[k].faults.min()) for k in (0, 1, 2)] == [0, 1, 1]
+
+
+def test_lanes_of_the_most_draws_have_names_of_their_own():
+    texts = np.zeros((1, 4, GOALS, 1))
+    names = lane_names(Trial(TASKS, np.zeros((4, GOALS, 3)), texts, draws=MOST_DRAWS))
+    assert len(np.unique(names)) == 4 * GOALS * MOST_DRAWS and names.min() >= 0

@@ -41,13 +41,13 @@ def make_run(path: Path, config: str = "ml4.yaml") -> None:
     [
         (["eval"], "required: --run", "--help"),
         (["eval", "--run", "nope"], "run directory nope does not exist", "train"),
-        (["eval", "--run", "x", "--k", "0,a"], "--k: invalid", "--help"),
-        (["eval", "--run", "x", "--k", "0,-1"], "--k: invalid", "--help"),
-        (["eval", "--run", "x", "--goals", "51"], "--goals is 51", "1 to 50"),
-        (["eval", "--run", "x", "--horizon", "0"], "--horizon is 0", "at least one"),
+        (["eval", "--run", "x", "--k", "0,a"], "--k: a is no whole number", "in this range"),
+        (["eval", "--run", "x", "--k", "0,-1"], "--k: -1 is no whole number", "in this range"),
+        (["eval", "--run", "x", "--goals", "51"], "51 is no whole number from 1 to 50", "has 50"),
+        (["eval", "--run", "x", "--horizon", "0"], "0 is no whole number from 1", "control steps"),
         (["eval", "--run", "x", "--goal-set", "hldout"], "'hldout'", "did you mean 'heldout'?"),
-        (["eval", "--run", "x", "--lanes", "0"], "--lanes is 0", "at least one"),
-        (["eval", "--run", "x", "--eval-seeds", "0"], "--eval-seeds is 0", "at least one"),
+        (["eval", "--run", "x", "--lanes", "0"], "--lanes: 0 is no whole number from 1", "range"),
+        (["eval", "--run", "x", "--eval-seeds", "0"], "--eval-seeds: 0 is no whole", "range"),
         (["eval", "--run", "x", "--tasks", "window-opn"], "unknown task", "'window-open'?"),
         (["eval", "--run", "x", "--tasks", "a,"], "unknown task 'a'", "valid: drawer-open"),
         (["eval", "--run", "x", "--k", "1,1"], "--k is '1,1'", "each once"),
@@ -62,9 +62,17 @@ def make_run(path: Path, config: str = "ml4.yaml") -> None:
             "--z other with --physics metaworld",
             "--z posterior",
         ),
+        (
+            ["eval", "--run", "x", "--lanes", "64", "--physics", "metaworld"],
+            "--lanes with --physics metaworld",
+            "--physics native",
+        ),
+        (["eval", "--run", "x", "--text", ""], "--text is empty", "--text-control zero"),
+        (["sweep", "--runs", "x", "--text", " \t"], "--text is empty", "write a sentence"),
         (["sweep"], "required: --runs", "--help"),
         (["sweep", "--runs", "x*"], "--runs x* matches no run", "runs/ml4-*"),
         (["sweep", "--runs", "x", "--checkpoints", "first"], "--checkpoints is 'first'", "all"),
+        (["sweep", "--runs", "x", "--checkpoints", "20,020"], "is '20,020'", "each once"),
         (["sweep", "--runs", "x", "--physics", "metaworld"], "--physics: invalid", "--help"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -93,6 +101,7 @@ def test_eval_hands_over_its_flags(calls, here):
     files = ["--checkpoint", "12", "--json", "out/f.json", "--csv", "out/f.csv"]
     assert main(["eval", "--run", "r", *PROTOCOL, *files]) == 0
     assert main(["eval", "--run", "r"]) == 0
+    (here / "w").mkdir()
     text = ["--text", "shut it", "--weights", "w"]
     assert main(["eval", "--run", "r", *text]) == 0
     assert calls[0] == {
@@ -130,4 +139,6 @@ def test_sweep_hands_over_its_flags(calls, refused, here):
 def test_eval_without_a_latent_does_not_adapt(calls, refused, here):
     make_run(here / "r", "mtsac.yaml")
     assert "--k 0,2" in refused("eval", "--run", "r", "--k", "0,2")[0]
+    own = ["--physics", "metaworld", "--adaptation-episodes", "5"]
+    assert "--adaptation-episodes 5" in refused("eval", "--run", "r", *own)[0]
     assert main(["eval", "--run", "r"]) == 0  # the run's own final_k is 0

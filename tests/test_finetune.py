@@ -147,8 +147,9 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         (["--task", "window"], "unknown task 'window'", "window-close"),
         (["--task", "drawer-open"], "was trained on drawer-open", "window-close"),
         (["--task", "window-close", "--adapt", "rooter"], "'rooter' is no way", "router"),
-        (["--task", "window-close", "--episodes", "0"], "--episodes is 0", "1 or more"),
-        (["--task", "window-close", "--goals", "51"], "--goals is 51", "50"),
+        (["--task", "window-close", "--episodes", "0"], "0 is no whole number", "range"),
+        (["--task", "window-close", "--goals", "51"], "from 1 to 50", "has 50 goals"),
+        (["--task", "window-close", "--adapt", "z,all,z"], "--adapt names z twice", "once"),
     ],
 )
 def test_mistakes_are_refused(undisturbed, refused, words, cause, cure):

@@ -214,6 +214,6 @@ def test_show_of_a_file(published, tmp_path, capsys, refused):
 
 def test_figure_is_a_picture(tmp_path, refused):
     cause, cure = refused("goals", "--figure", str(tmp_path / "f.tbl"))
-    assert "cannot write" in cause and ".png" in cure
+    assert "no ending of a picture" in cause and ".png" in cure
     assert main(["goals", "--figure", str(tmp_path / "new" / "f.png")]) == 0
     assert (tmp_path / "new" / "f.png").read_bytes().startswith(b"\x89PNG")

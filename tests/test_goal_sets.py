@@ -4,13 +4,14 @@ import pickle
 import subprocess
 import sys
 from collections import OrderedDict
+from pathlib import Path
 
 import metaworld
 import numpy as np
 import pytest
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
 
-from envs import goal_sets
+from envs import goal_names, goal_sets
 from envs.goal_sets import RESET_BOX, SEEDS, TASKS, draw_goals, load_goal_set
 
 
@@ -89,11 +90,32 @@ def test_fresh_set_is_drawn_once_then_cached(tmp_path, monkeypatch):
     np.testing.assert_array_equal(load_goal_set("fresh:7", ("window-close",)), drawn)
 
 
-def test_fresh_set_with_a_packaged_sets_seed_is_that_set(tmp_path):
-    np.testing.assert_array_equal(
-        load_goal_set("fresh:1000", ("drawer-close",), tmp_path),
-        load_goal_set("heldout", ("drawer-close",)),
-    )
+@pytest.mark.parametrize("name", ["fresh:0", "fresh:1000", "fresh:007", "fresh:00"])
+def test_a_set_has_one_name(name):
+    """Evaluations tell their figures apart by it, and `fresh:0` has the goals of `train`."""
+    only = {"fresh:1000": "heldout", "fresh:007": "fresh:7"}.get(name, "train")
+    with pytest.raises(ValueError, match=f"'{name}' is the goal set '{only}'\ncall it {only}$"):
+        load_goal_set(name, ("drawer-close",))
+
+
+def test_a_seed_has_one_set():
+    names = {seed: goal_names.name_of(seed) for seed in (0, 7, 1000, goal_names.LARGEST_SEED)}
+    assert list(names.values()) == ["train", "fresh:7", "heldout", "fresh:2147483647"]
+    assert {goal_names.seed_of(name): name for name in names.values()} == names
+
+
+def homeless(_):
+    raise RuntimeError("Could not determine home directory.")
+
+
+@pytest.mark.parametrize("home", ["no home", "a cache that cannot be looked at"])
+def test_a_set_can_be_drawn_without_a_cache(home, monkeypatch):
+    if home == "no home":
+        monkeypatch.delenv("CMRL_JAX_CACHE", raising=False)
+        monkeypatch.setattr(Path, "expanduser", homeless)
+    else:
+        monkeypatch.setenv("CMRL_JAX_CACHE", "x" * 300)
+    assert load_goal_set("fresh:8", ("drawer-open",)).shape == (1, 50, 3)
 
 
 def test_unwritable_cache_does_not_stop_a_run(tmp_path):
@@ -121,10 +143,10 @@ def test_packaged_sets_need_no_metaworld_and_no_simulator():
     ("name", "tasks", "cause"),
     [
         ("held-out", TASKS, "did you mean 'heldout'"),
-        ("fresh", TASKS, "unknown goal set 'fresh'"),
-        ("fresh:", TASKS, "unknown goal set"),
-        ("fresh:-1", TASKS, "unknown goal set"),
-        ("fresh:4294967296", TASKS, "too large"),
+        ("fresh", TASKS, "'fresh' is no goal set"),
+        ("fresh:", TASKS, "no goal set"),
+        ("fresh:-1", TASKS, "no goal set"),
+        ("fresh:2147483648", TASKS, "too large"),
         ("train", ("drawer-opn",), "did you mean 'drawer-open'"),
     ],
 )

@@ -96,4 +96,4 @@ def test_plot_draws_pictures_of_the_runs(run, capsys, tmp_path):
 
 def test_a_directory_without_metrics_is_refused(tmp_path, refused):
     cause, cure = refused("plot", "--run", str(tmp_path))
-    assert "metrics.csv does not exist" in cause and "--run" in cure
+    assert "holds no run" in cause and "train first" in cure

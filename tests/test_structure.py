@@ -19,6 +19,7 @@ MODULES = {
 }
 # Read and checked before jax is imported.
 LIGHT = {
+    "commands",
     "config",
     "validate",
     "config_io",
@@ -33,6 +34,7 @@ LIGHT = {
     "goals_cli",
     "cli",
 }
+LIGHT_OF_ENVS = {"command_line", "goal_names"}  # what those take from envs
 COMMANDS = {
     "cli",
     "evaluate_flags",
@@ -77,7 +79,7 @@ ROWS = (
     {"goal_files", "pca"},
     {"manifest", "named_arrays", "parallel"},
     {"validate"},
-    {"config"},
+    {"config", "commands"},
 )
 
 
@@ -127,11 +129,19 @@ def test_envs_know_nothing_of_the_learner():
 
 @pytest.mark.parametrize("name", sorted(LIGHT))
 def test_configuration_imports_nothing_heavy(name):
-    allowed = set(sys.stdlib_module_names) | {"yaml", "cmrl_jax"}
+    allowed = set(sys.stdlib_module_names) | {"yaml", "cmrl_jax", "envs"}
     path = MODULES[f"cmrl_jax.{name}"]
     top = name in COMMANDS
     assert {i.partition(".")[0] for i in imports(path, top)} <= allowed
-    assert {m.rpartition(".")[2] for m in own(f"cmrl_jax.{name}", top)} <= LIGHT
+    light = {f"cmrl_jax.{m}" for m in LIGHT} | {f"envs.{m}" for m in LIGHT_OF_ENVS}
+    assert own(f"cmrl_jax.{name}", top) <= light
+
+
+@pytest.mark.parametrize("name", sorted(LIGHT_OF_ENVS))
+def test_what_a_command_line_takes_from_envs_is_light(name):
+    found = set(imports(MODULES[f"envs.{name}"]))
+    assert {i.partition(".")[0] for i in found} <= set(sys.stdlib_module_names) | {"envs"}
+    assert own(f"envs.{name}") <= {f"envs.{m}" for m in LIGHT_OF_ENVS}
 
 
 def test_imports_point_one_way():

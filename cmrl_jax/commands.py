@@ -1,0 +1,33 @@
+"""Commands as a user would type them, to be pasted into a shell."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+SCRIPT = "cmrl"  # what the installed package is called by
+CHILD = "import sys; from cmrl_jax.cli import main; sys.exit(main())"
+"""The program for a process of its own, `python -c CHILD WORD ...`, installed or not."""
+
+
+def program() -> str:
+    """How this process was started: `cmrl`, or `python train.py`."""
+    started = Path(sys.argv[0])
+    if started.name == SCRIPT:  # a script on the PATH is handed its full name
+        found = shutil.which(SCRIPT)
+        on_path = found is not None and Path(found).resolve() == started.resolve()
+        return SCRIPT if on_path else shlex.quote(str(started))
+    script = str(started) if started.name == "train.py" else "train.py"
+    return f"python {shlex.quote(script)}"
+
+
+def command(*words: object) -> str:
+    """A call of this program with these words, each quoted where a shell needs it."""
+    return f"{program()} {quoted(*words)}"
+
+
+def quoted(*words: object) -> str:
+    """Words of a command, each quoted where a shell needs it."""
+    return shlex.join(str(word) for word in words)
