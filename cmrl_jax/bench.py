@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from cmrl_jax import bench_physics, bench_stages
 from cmrl_jax.bench_physics import best_seconds
 from cmrl_jax.collect import init_run
+from cmrl_jax.commands import CHILD
 from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import load_config
 from cmrl_jax.metrics import package_versions
@@ -100,7 +101,7 @@ def bench_start(config: Config, report: Report) -> None:
 def time_to_iterations(folder: Path, name: str) -> tuple[float, float]:
     """Seconds to the end of iteration 0, and peak memory in MB by the end of iteration 1."""
     script = Path(__file__).resolve().parent.parent / "train.py"
-    launch = [str(script)] if script.is_file() else ["-m", "cmrl_jax"]
+    launch = [str(script)] if script.is_file() else ["-c", CHILD]
     command = [sys.executable, *launch, "--config", CONFIG, "--run", str(folder / name)]
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache")}
     started = time.perf_counter()

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from cmrl_jax.commands import CHILD
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.scores import ScoreCsv, cell_rows, of_policy
@@ -92,7 +93,6 @@ def time_commands(target: Target, options: EvalOptions) -> dict[str, Any]:
     Returns:
         `cells`, `seconds`.
     """
-    program = "import sys; from cmrl_jax.cli import main; sys.exit(main())"
     root = Path(__file__).resolve().parent.parent
     paths = os.pathsep.join(p for p in (str(root), os.environ.get("PYTHONPATH")) if p)
     started = 0.0
@@ -101,7 +101,7 @@ def time_commands(target: Target, options: EvalOptions) -> dict[str, Any]:
             started = time.monotonic()
         task = target.tasks[call % len(target.tasks)]
         subprocess.run(
-            [sys.executable, "-c", program, "eval", *command_words(target, options, task)],
+            [sys.executable, "-c", CHILD, "eval", *command_words(target, options, task)],
             check=True,
             capture_output=True,
             env=os.environ | {"PYTHONPATH": paths},

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import yaml
 
+from cmrl_jax.commands import quoted
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
 from cmrl_jax.validate import validate
 
@@ -126,7 +127,8 @@ def check_resumable(saved: Mapping[str, Any], config: Config, run: Path) -> None
         shown = "; ".join(f"{name}: {_show(old)} -> {_show(new)}" for name, old, new in changed)
         raise ConfigError(
             f"{run} was started with another configuration: {shown}",
-            f"resume with --config {run / 'config.yaml'}, or start a new run without --resume",
+            f"resume with {quoted('--config', run / 'config.yaml')}, or start a new run without "
+            "--resume",
         )
 
 

@@ -26,6 +26,7 @@ from cmrl_jax.collect import (
     metric_names,
     metric_row,
 )
+from cmrl_jax.commands import command
 from cmrl_jax.config import Config, ConfigError, lanes_per_task
 from cmrl_jax.goals import check_same_table
 from cmrl_jax.metrics import (
@@ -330,4 +331,4 @@ class _Run:
         return 0
 
     def resume_command(self) -> str:
-        return f"python train.py --run {self.run_dir} --resume"
+        return command("--run", self.run_dir, "--resume")

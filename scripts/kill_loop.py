@@ -26,6 +26,9 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]  # this working tree, whatever is installed
 
+from cmrl_jax.flags import natural, seed  # noqa: E402
+from envs.command_line import typed_path, whole  # noqa: E402
+
 STEPS = 600  # env steps of an iteration of smoke.yaml
 SAVING = re.compile(r"(\d+)\.orbax-checkpoint-tmp")
 
@@ -139,11 +142,13 @@ def unreadable(run: Path) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--in-saves", type=int, default=5)
-    parser.add_argument("--iterations", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0, help="of the moments")
-    parser.add_argument("--dir", type=Path, help="where both runs are kept [a temporary directory]")
+    parser.add_argument("--kills", type=whole(2), default=20)
+    parser.add_argument("--in-saves", type=natural, default=5)
+    parser.add_argument("--iterations", type=whole(3), default=40)
+    parser.add_argument("--seed", type=seed, default=0, help="of the moments")
+    parser.add_argument(
+        "--dir", type=typed_path, help="where both runs are kept [a temporary directory]"
+    )
     args = parser.parse_args()
     folder = args.dir or Path(tempfile.mkdtemp(prefix="kill-loop-"))
     folder.mkdir(parents=True, exist_ok=True)
