@@ -14,11 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs.quiet_mjx import mjx  # isort: skip, it comes before mjx's own parts
-from mujoco.mjx._src import forward as mjx_forward
-from mujoco.mjx._src import math as mjx_math
-from mujoco.mjx._src import smooth as mjx_smooth
-
+from envs import rotations
 from envs.contact import Contacts, find_contacts
 from envs.geometry import FixtureShapes, load_gripper, load_shapes
 from envs.model import (
@@ -35,6 +31,7 @@ from envs.model import (
     load_scene,
 )
 from envs.physics import FRAME_SKIP, Positions, settled_starts
+from envs.quiet_mjx import mjx
 from envs.solver import Cones, Rows, make_cones, make_rows, solve
 from envs.tasks import ACTION_SCALE, HAND_HIGH, HAND_LOW
 
@@ -145,7 +142,7 @@ class MjxPhysics:
         """Positions after kinematics, as Meta-World reads them after `mj_forward`."""
         scene = self.scene(scene_id)
         data = self._data.replace(qpos=state.qpos[:ROBOT_JOINTS])
-        data = mjx_smooth.kinematics(self.model, data)
+        data = mjx.kinematics(self.model, data)
         pos, rot = data.xpos[ARM_JOINTS], data.xmat[ARM_JOINTS]
         fingers, axes = state.qpos[RIGHT_FINGER : LEFT_FINGER + 1], self._gripper.finger_axis
         moved = [
@@ -167,7 +164,11 @@ class MjxPhysics:
         )
         data = _fence(self._smooth_dynamics(data))
         fixture = scene.fixture
-        mass = jnp.zeros((JOINTS, JOINTS)).at[:ROBOT_JOINTS, :ROBOT_JOINTS].set(data._impl.M)
+        mass = (
+            jnp.zeros((JOINTS, JOINTS))
+            .at[:ROBOT_JOINTS, :ROBOT_JOINTS]
+            .set(mjx.full_m(self.model, data))
+        )
         mass = mass.at[SLIDE, SLIDE].set(fixture.inertia)
         # The slides are horizontal: gravity does no work on a fixture, damping is all it has.
         slide_force = -fixture.damping * state.qvel[SLIDE]
@@ -198,14 +199,14 @@ class MjxPhysics:
     def _smooth_dynamics(self, data: mjx.Data) -> mjx.Data:
         """The arm without constraints: MJX's own stages up to qacc_smooth."""
         model = self.model
-        data = mjx_smooth.kinematics(model, data)
-        data = mjx_smooth.com_pos(model, data)
-        data = mjx_smooth.crb(model, data)
-        data = mjx_smooth.factor_m(model, data)
-        data = mjx_smooth.transmission(model, data)
-        data = mjx_forward.fwd_velocity(model, data)
-        data = mjx_forward.fwd_actuation(model, data)
-        return mjx_forward.fwd_acceleration(model, data)
+        data = mjx.kinematics(model, data)
+        data = mjx.com_pos(model, data)
+        data = mjx.crb(model, data)
+        data = mjx.factor_m(model, data)
+        data = mjx.transmission(model, data)
+        data = mjx.fwd_velocity(model, data)
+        data = mjx.fwd_actuation(model, data)
+        return mjx.fwd_acceleration(model, data)
 
     def _constraints(
         self, state: PhysicsState, data: mjx.Data, scene: SceneData
@@ -232,11 +233,13 @@ class MjxPhysics:
         hand = pos + rot @ self._hand_pos
         translate, rotate = self._robot_jacobian(data, hand)  # (joint, 3) each
         error = state.mocap - hand
-        hand_inverse = mjx_math.quat_inv(mjx_math.quat_mul(data.xquat[ARM_JOINTS], self._hand_quat))
+        hand_inverse = rotations.conjugate(
+            rotations.multiply(data.xquat[ARM_JOINTS], self._hand_quat)
+        )
         # Mocap orientation (1, 0, 1, 0) times the weld's relative pose (-1, 0, 0, 0).
         target = jnp.array([-1.0, 0.0, -1.0, 0.0]) / jnp.sqrt(2.0)
-        twist = mjx_math.quat_mul(hand_inverse, target)[1:] * WELD_TORQUE_SCALE
-        turn = lambda j: mjx_math.quat_mul(mjx_math.quat_mul_axis(hand_inverse, j), target)[1:]
+        twist = rotations.multiply(hand_inverse, target)[1:] * WELD_TORQUE_SCALE
+        turn = lambda j: rotations.multiply(rotations.multiply_vector(hand_inverse, j), target)[1:]
         turned = 0.5 * jax.vmap(turn)(-rotate * WELD_TORQUE_SCALE)
         jacobian = jnp.concatenate([-translate.T, turned.T])
         error = jnp.concatenate([error, twist])
@@ -300,7 +303,7 @@ class MjxPhysics:
         translate = translate.at[:, ARM_JOINTS:].set(axes) * mask[..., None]
         fixture = contacts.moves[:, None] * scene.fixture.axis  # (contact, 3)
         relative = jnp.concatenate([-translate, fixture[:, None]], 1)  # (contact, joint, 3)
-        frame = jax.vmap(mjx_math.make_frame)(contacts.normal)  # (contact, 3, 3), normal first
+        frame = jax.vmap(rotations.contact_frame)(contacts.normal)  # (contact, 3, 3), normal first
         motion = jnp.einsum("cfx,cjx->cfj", frame, relative)
         spin = -jnp.einsum("cx,cjx->cj", contacts.normal, rotate * mask[..., None])
         spin = jnp.pad(spin, ((0, 0), (0, 1)))[:, None]

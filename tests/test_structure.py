@@ -185,6 +185,12 @@ def test_training_and_evaluation_need_no_encoder():
         assert not reached & encoder, name
 
 
+def test_private_parts_of_libraries_stay_private():
+    for name, path in MODULES.items():
+        private = {i for i in imports(path) if "._" in i and not i.startswith(("cmrl_jax", "envs"))}
+        assert not private, name
+
+
 def test_what_we_import_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     declared = project["dependencies"] + project["optional-dependencies"]["viz"]
