@@ -71,6 +71,7 @@ def make_train_iteration(
     goal_vectors: jax.Array,
     placements: jax.Array | None,
     freeze_statistics: bool = False,
+    learn_at_once: bool = False,
 ) -> TrainIteration:
     """Builds the iteration of a validated configuration.
 
@@ -79,10 +80,11 @@ def make_train_iteration(
         placements: fixture placements (task, goal, 3) to draw from at a reset
             (`env.variation: fixed_50`); None draws from Meta-World's reset box.
         freeze_statistics: keep the statistics of observations and returns as they are.
+        learn_at_once: iteration 0 makes gradient steps, as every later one.
 
     Returns:
-        (RunState) -> RunState, metrics. Iteration 0 makes no gradient step, and its losses are NaN.
-        Metrics are float32, () or one value a training task (task,).
+        (RunState) -> RunState, metrics. Without `learn_at_once` iteration 0 makes no gradient step,
+        and its losses are NaN. Metrics are float32, () or one value a training task (task,).
     """
     collect, horizon = config.collect, config.env.horizon
     num_tasks, per_task = len(config.tasks.train), lanes_per_task(config)
@@ -91,10 +93,7 @@ def make_train_iteration(
     train_task = jnp.repeat(jnp.arange(num_tasks), per_task)  # (lane,) row of the rings
     groups = lane_groups(config)
     source = np.tile(np.repeat(np.arange(3), groups), num_tasks)  # (lane,) index of Z_SOURCES
-    # Dealt out so that each group of a task has the whole range of scales.
-    scale = np.geomspace(1.0, collect.noise_scale, per_task)
-    shuffled = np.random.default_rng(0).permutation(per_task)
-    lane_scale = jnp.asarray(np.tile(scale[shuffled], num_tasks), jnp.float32)  # (lane,)
+    noise_scale = make_noise_scale(config)
     writers = groups[0] if collect.context_lanes == "prior" else per_task
     inference = learner.inference
     diagnose = make_diagnose(config, learner, goal_vectors)
@@ -160,7 +159,7 @@ def make_train_iteration(
         k_z, k_reset, k_noise, k_chunks, k_diagnose, key = jax.random.split(run.key, 6)
         zc, actual_source = draw_conditioning(run, k_z)
 
-        noise = lane_scale[:, None] * correlated_noise(
+        noise = noise_scale(k_noise)[:, None] * correlated_noise(
             k_noise, horizon, (lanes, ACTION_SIZE), collect.noise_correlation
         )
         noise = noise.reshape(-1, collect.chunk, lanes, ACTION_SIZE)
@@ -182,7 +181,10 @@ def make_train_iteration(
                 noise=chunk_noise,
             )
             run = store(run, jax.tree.map(by_task, parallel.gather(transitions)))
-            run, metrics = jax.lax.cond(is_first, skip_steps, train_steps, run, k_update)
+            if learn_at_once:
+                run, metrics = train_steps(run, k_update)
+            else:
+                run, metrics = jax.lax.cond(is_first, skip_steps, train_steps, run, k_update)
             return (run, state), (metrics, transitions.reward, stats)
 
         run = run.replace(key=key)
@@ -224,6 +226,23 @@ def make_train_iteration(
         )
 
     return train_iteration
+
+
+def make_noise_scale(config: Config) -> Callable[[jax.Array], jax.Array]:
+    """How much wider than the policy's own the noise of each lane is: key of an episode -> (lane,).
+
+    Several lanes of a task cover 1 to `collect.noise_scale` in every episode. A single one cannot:
+    it draws its scale from that range anew in each, so that over episodes it explores as they do.
+    """
+    per_task, widest = lanes_per_task(config), config.collect.noise_scale
+    lanes = len(config.tasks.train) * per_task
+    if per_task == 1:
+        return lambda key: widest ** jax.random.uniform(jax.random.fold_in(key, 0), (lanes,))
+    # Dealt out so that each group of a task has the whole range of scales.
+    shuffled = np.random.default_rng(0).permutation(per_task)
+    scale = np.geomspace(1.0, widest, per_task)[shuffled]
+    fixed = jnp.asarray(np.tile(scale, lanes // per_task), jnp.float32)
+    return lambda key: fixed
 
 
 def episode_metrics(

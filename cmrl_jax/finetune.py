@@ -1,10 +1,12 @@
 """Fine-tuning on a task that was held out: success against the policy's own experience there.
 
 One lane gathers episode after episode of the task, on goals of its own; gradient steps change what
-`adapt` allows. At the read-outs the policy is scored on a named goal set: z from the belief over
-all own transitions, no further adaptation. Normalisers stay those of training, and rewards are
-divided by the mean of the training tasks' denominators (algorithm.md 4.5, 5.6); `scratch` is SAC
-that knows nothing and keeps statistics of its own.
+`adapt` allows, as many in the first episode as in every later one, so that after k episodes the
+ways that learn have made equally many. At the read-outs the policy is scored on a named goal set: z from the
+belief over all own transitions, no further adaptation. Normalisers stay those of training, and
+rewards are divided by the mean of the training tasks' denominators (algorithm.md 4.5, 5.6);
+`scratch` is SAC that knows nothing: its first episode has random actions, and it keeps statistics
+of its own.
 """
 
 from __future__ import annotations
@@ -50,11 +52,20 @@ _NETWORKS = (
 
 
 class Score(NamedTuple):
-    """Means over the goals of a read-out."""
+    """A read-out: means over its goals, and what went wrong until then.
+
+    Attributes:
+        faults: times a lane's physics was put back, mean over goals.
+        own_faults: times it was put back in the own episodes so far.
+        skipped: gradient steps so far that were dropped for a non-finite gradient.
+    """
 
     success_any: float
     success_last: float
     returns: float
+    faults: float
+    own_faults: int = 0
+    skipped: int = 0
 
 
 def finetune_config(
@@ -74,8 +85,9 @@ def finetune_config(
     # Also from scratch: every way sees the observations of the run, in episodes and chunks as its.
     env, chunk = config.env, config.collect.chunk
     if adapt == "scratch":
-        config = load_config("sac.yaml", {"sac.batch": str(config.sac.batch)})
-        sac = config.sac
+        batch = config.sac.batch
+        config = load_config("sac.yaml")
+        sac = replace(config.sac, batch=batch, n_step=min(config.sac.n_step, env.horizon))
     else:
         scale = config.sac.reward_scale / denominator
         sac = replace(config.sac, reward_norm="none", reward_scale=scale, task_rows=0)
@@ -165,15 +177,20 @@ def restrict(learner: Learner, adapt: str) -> Learner:
 
 
 def start_state(
-    adapt: str, config: Config, learner: Learner, trained: TrainState, text: jax.Array
+    adapt: str,
+    config: Config,
+    learner: Learner,
+    fresh: TrainState,
+    trained: TrainState,
+    text: jax.Array,
 ) -> TrainState:
     """A learner's first state, with what was trained in its place.
 
     Args:
+        fresh: a first state of `learner`.
         trained: the run's state, of any number of tasks.
         text: text vector of the new task (G,).
     """
-    fresh = learner.init(jax.random.key(config.seed))
     if adapt == "scratch":
         return jax.tree.map(jnp.copy, fresh)  # every leaf a buffer of its own, to be donated
     kept = {name: getattr(trained, name) for name in _NETWORKS}
@@ -223,15 +240,27 @@ class FineTuning:
         self.learner = restrict(learner, adapt)
         self.text, self.task = text, options.task
         iteration = make_train_iteration(
-            self.config, self.env, self.learner, goals, None, freeze_statistics=adapt != "scratch"
+            self.config,
+            self.env,
+            self.learner,
+            goals,
+            None,
+            freeze_statistics=adapt != "scratch",
+            learn_at_once=True,
         )
         self.iteration = jax.jit(iteration, donate_argnums=0)
         self.episode = jax.jit(
             make_episode(self.config, self.env, self.learner, self.config.env.horizon)
         )
-        first = start_state(adapt, self.config, learner, trained, jnp.asarray(text))
-        run = init_run(self.config, self.learner, jax.random.key(options.seed))
+        run = init_run(self.config, learner, jax.random.key(options.seed))
+        first = start_state(adapt, self.config, learner, run.learner, trained, jnp.asarray(text))
         self.run = run.replace(learner=first)
+        self.own_faults = 0
+
+    def gather(self) -> None:
+        """One own episode, with its gradient steps."""
+        self.run, metrics = self.iteration(self.run)
+        self.own_faults += int(metrics["physics_faults"])
 
     def read_out(self, placements: np.ndarray, seed: int) -> Score:
         """Success on goals (goal, 3), with the belief over all own transitions."""
@@ -257,12 +286,13 @@ class FineTuning:
             np.bool_(True),
             jax.random.key(seed),
         )
-        return mean_score(scores)
+        skipped = int(state.skipped_updates)
+        return mean_score(scores)._replace(own_faults=self.own_faults, skipped=skipped)
 
 
 def mean_score(scores: Episode) -> Score:
     """Means over all lanes."""
-    figures = (scores.success_any, scores.success_last, scores.returns)
+    figures = (scores.success_any, scores.success_last, scores.returns, scores.faults)
     return Score(*(float(np.mean(figure)) for figure in figures))
 
 
@@ -292,7 +322,7 @@ def adaptation_curve(
     curve = {}
     for episode in range(options.episodes + 1):
         if episode:
-            tuning.run, _ = tuning.iteration(tuning.run)
+            tuning.gather()
         if episode in options.read_outs:
             curve[episode] = tuning.read_out(placements, options.seed)
             say(episode, curve[episode])

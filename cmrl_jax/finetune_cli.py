@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from cmrl_jax.finetune_flags import FinetuneOptions, check_run
 from cmrl_jax.goals import check_same_table, load_goals
 from cmrl_jax.learner import TrainState
 from cmrl_jax.metrics import package_versions
+from cmrl_jax.scores import fault_warning
 from cmrl_jax.session import Session, prepare_jax
 
 Curves = dict[str, dict[int, Score]]
@@ -40,6 +41,8 @@ def finetune_run(
     """
     config = resolve(*read_yaml(run / "config.yaml"))
     check_run(config, options)
+    # From here on the physics really used, for the results' record.
+    options = replace(options, physics=options.physics or config.env.physics)
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
     trained, meta = load_learner(run, config, session)
@@ -65,6 +68,8 @@ def finetune_run(
         curves[adapt] = adaptation_curve(
             tuning, options, placements, lambda n, score, adapt=adapt: _say(adapt, n, score)
         )
+        for line in warnings_of(adapt, curves[adapt]):
+            print(line, flush=True)
         if json_path is not None:  # after each way: a stopped command keeps what it has
             result = as_json(curves) | asdict(options) | {"run": run.as_posix()}
             result |= {"iteration": meta["iteration"], "versions": package_versions()}
@@ -86,19 +91,35 @@ def load_learner(run: Path, config: Config, session: Session) -> tuple[TrainStat
 
 
 def as_json(curves: Curves) -> dict[str, Any]:
-    """`{"curves": {adapt: {episodes: {"success_any": .., "success_last": .., "return": ..}}}}`."""
+    """`{"curves": {adapt: {episodes: {"success_any": .., "success_last": .., "return": .., ..}}}}`.
+
+    The others are `faults`, `own_faults` and `skipped_updates`, see `finetune.Score`.
+    """
     figures = {
         adapt: {
             str(n): {
                 "success_any": score.success_any,
                 "success_last": score.success_last,
                 "return": score.returns,
+                "faults": score.faults,
+                "own_faults": score.own_faults,
+                "skipped_updates": score.skipped,
             }
             for n, score in curve.items()
         }
         for adapt, curve in curves.items()
     }
     return {"curves": figures}
+
+
+def warnings_of(adapt: str, curve: dict[int, Score]) -> list[str]:
+    """Lines on what a way's curve rests on beside experience: physics put back, steps dropped."""
+    read_outs = {str(n): {"faults": score.faults} for n, score in curve.items()}
+    own = {str(n): {"faults": score.own_faults} for n, score in curve.items()}
+    lines = fault_warning({f"{adapt} (read-outs)": read_outs, f"{adapt} (own episodes)": own})
+    if skipped := max(score.skipped for score in curve.values()):
+        lines.append(f"warning: {adapt}: {skipped} gradients were non-finite and were skipped")
+    return lines
 
 
 def _say(adapt: str, episodes: int, score: Score) -> None:

@@ -30,6 +30,7 @@ from cmrl_jax.learner import make_learner
 from cmrl_jax.replay import ContextBatch
 from cmrl_jax.session import Session
 from cmrl_jax.validate import validate
+from envs.native import NativePhysics
 
 NETWORKS = ("actor_params", "critic_params", "target_critic_params", "encoder_params")
 
@@ -132,12 +133,11 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         critic_params=spread(made.state.critic_params),
         log_alpha=jnp.array([-1.0, -2.0, -6.0]),
     )
-    state = start_state("all", config, learner, trained, GOALS[0, 0])
+    fresh = learner.init(jax.random.key(5))
+    state = start_state("all", config, learner, fresh, trained, GOALS[0, 0])
     assert not changed(trained, state)
     np.testing.assert_allclose(state.log_alpha, [-3.0])  # the mean of the training tasks'
-    fresh = start_state("scratch", config, learner, trained, GOALS[0, 0])
-    begun = {path.split("/")[0] for path in changed(trained, fresh)}
-    assert begun == {"actor_params", "critic_params"}
+    assert not changed(fresh, start_state("scratch", config, learner, fresh, trained, GOALS[0, 0]))
     assert trained.log_alpha.shape == (TASKS,)
 
 
@@ -196,6 +196,20 @@ def test_every_way_is_a_valid_configuration(adapt):
         finetune_config(config, "window-close", adapt, 2, -1, 1.0)
 
 
+@pytest.mark.parametrize("adapt", ADAPT)
+def test_what_a_run_could_be_trained_with_can_be_adapted(adapt):
+    """No rule of sac.yaml's own sizes is met, which no flag of `finetune` could mend."""
+    config = tiny_config(sac={"batch": 200_000, "n_step": 2}, collect={"lanes": 12, "chunk": 1})
+    config = replace(
+        config,
+        env=replace(config.env, horizon=2),
+        train=replace(config.train, capacity=400_000),
+    )
+    validate(config)
+    tuned = finetune_config(config, "window-close", adapt, 2, 1, 1.0)
+    assert (tuned.env.horizon, tuned.sac.n_step, tuned.sac.batch) == (2, 2, 200_000)
+
+
 @pytest.mark.parametrize(
     ("figure", "cause", "cure"),
     [
@@ -238,7 +252,42 @@ def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
     assert set(curves) == {"posterior", "router"} and list(curves["router"]) == ["0", "1", "2"]
     assert curves["posterior"]["0"] == curves["router"]["0"]
     assert result["task"] == "window-close" and result["episodes"] == 2
-    assert "router" in capsys.readouterr().out
+    assert result["physics"] == "native"  # of the run: none was asked for
+    out = capsys.readouterr().out
+    assert "router" in out and "warning" not in out
+
+
+def test_physics_faults_are_counted_and_told(undisturbed, tmp_path, capsys, monkeypatch):
+    """Of read-outs as a mean over lanes, of own episodes as a sum so far."""
+    calls = iter(range(10**9))
+    original = NativePhysics._simulate
+    # A read-out of 50 steps, an own episode, a read-out: 3 steps, 1 step and none are broken.
+    broken = {7, 8, 9, 50 + 5}
+
+    def simulate(self, words, placement, action, scene_id):
+        if next(calls) in broken:
+            action = np.full_like(action, np.nan)
+        return original(self, words, placement, action, scene_id)
+
+    monkeypatch.setattr(NativePhysics, "_simulate", simulate)
+    out = tmp_path / "curves.json"
+    words = ["--episodes", "1", "--goals", "2", "--adapt", "posterior", "--json", str(out)]
+    assert main(["finetune", "--run", str(undisturbed), "--task", "window-close", *words]) == 0
+    curve = json.loads(out.read_text())["curves"]["posterior"]
+    assert [(curve[n]["faults"], curve[n]["own_faults"]) for n in "01"] == [(3.0, 0), (0.0, 1)]
+    assert (
+        "warning: physics became non-finite and was put back: posterior (read-outs) 3 times a "
+        "lane, posterior (own episodes) 1 times a lane\n"
+    ) in capsys.readouterr().out
+
+
+def test_dropped_gradient_steps_are_told():
+    score = finetune.Score(0.0, 0.0, 0.0, faults=0.0)
+    curve = {0: score, 1: score._replace(skipped=7)}
+    [line] = finetune_cli.warnings_of("all", curve)
+    assert line == "warning: all: 7 gradients were non-finite and were skipped"
+    figures = finetune_cli.as_json({"all": curve})["curves"]["all"]
+    assert [figures[n]["skipped_updates"] for n in "01"] == [0, 7]
 
 
 @pytest.fixture(scope="module")
@@ -254,9 +303,9 @@ def restored(undisturbed):
 
 @pytest.mark.parametrize("adapt", ["z", "all", "scratch"])
 def test_own_episodes_change_what_is_adapted(restored, adapt):
-    """The first episode makes no gradient step, the second one does."""
+    """The first as every other: gradient steps of each episode have been made at its read-out."""
     config, trained, text, placements = restored
-    options = FinetuneOptions("window-close", episodes=2)
+    options = FinetuneOptions("window-close", episodes=2, updates=1)
     tuned = finetune_config(config, options.task, adapt, options.episodes, options.updates, 1.0)
     tuning = FineTuning(tuned, adapt, trained, text, options)
     states = []
@@ -267,10 +316,23 @@ def test_own_episodes_change_what_is_adapted(restored, adapt):
 
     curve = adaptation_curve(tuning, options, placements, say)
     assert list(curve) == [0, 1, 2] and tuning.run.replay.size == 2 * config.env.horizon
-    assert not changed(states[0], states[1])
-    moved = changed(states[1], states[2])
-    if adapt == "z":
-        assert moved == {"encoder_params/z"} and curve[0] == curve[1]
-    else:
-        networks = NETWORKS if adapt == "all" else NETWORKS[:3]
-        assert {path.split("/")[0] for path in moved} == set(networks)
+    assert [state.gradient_steps for state in states] == [0, 50, 100]
+    for before, after in zip(states, states[1:], strict=False):
+        moved = changed(before, after)
+        if adapt == "z":
+            assert moved == {"encoder_params/z"}
+        else:
+            networks = NETWORKS if adapt == "all" else NETWORKS[:3]
+            assert {path.split("/")[0] for path in moved} == set(networks)
+
+
+def test_the_seed_is_that_of_the_networks_that_begin_from_nothing(restored):
+    config, trained, text, _ = restored
+    first = {}
+    for adapt, seed in (("all", 0), ("all", 1), ("scratch", 0), ("scratch", 1)):
+        tuned = finetune_config(config, "window-close", adapt, 1, 1, 1.0)
+        options = FinetuneOptions("window-close", episodes=1, seed=seed)
+        first[adapt, seed] = FineTuning(tuned, adapt, trained, text, options).run.learner
+    assert not changed(first["all", 0], first["all", 1])
+    begun = {path.split("/")[0] for path in changed(first["scratch", 0], first["scratch", 1])}
+    assert begun == set(NETWORKS[:3])

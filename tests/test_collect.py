@@ -1,0 +1,33 @@
+"""Exploration: how much wider than the policy's own the noise of a lane is."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from cmrl_jax.collect import make_noise_scale
+from cmrl_jax.config import Config
+
+
+def config_of(lanes):
+    config = Config()  # three tasks, noise up to 6 times as wide
+    return replace(config, collect=replace(config.collect, lanes=lanes))
+
+
+def test_several_lanes_of_a_task_cover_the_range_in_every_episode():
+    scale = make_noise_scale(config_of(12))
+    first, second = (np.asarray(scale(jax.random.key(seed))) for seed in (0, 1))
+    np.testing.assert_array_equal(first, second)
+    expected = [6.0 ** (i / 3) for i in range(4)]
+    np.testing.assert_allclose(np.sort(first.reshape(3, 4)), [expected] * 3, rtol=1e-6)
+
+
+def test_a_single_lane_of_a_task_covers_it_over_episodes():
+    scale = jax.jit(jax.vmap(make_noise_scale(config_of(3))))
+    drawn = np.asarray(scale(jax.random.split(jax.random.key(0), 4000)))  # (episode, lane)
+    assert drawn.min() >= 1.0 and drawn.max() <= 6.0
+    # As evenly over the logarithm as many lanes are.
+    for quantile in (0.01, 0.25, 0.5, 0.75, 0.99):
+        expected = 6.0**quantile
+        np.testing.assert_allclose(np.quantile(drawn, quantile, axis=0), expected, rtol=0.1)
+    assert np.abs(np.corrcoef(np.log(drawn).T) - np.eye(3)).max() < 0.1
