@@ -24,6 +24,7 @@ from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import check_resumable
 from cmrl_jax.manifest import find_damage, fingerprint, is_listed, write_manifest
 from cmrl_jax.named_arrays import describe, flatten, not_finite, placed, unflatten
+from cmrl_jax.old_statistics import as_stored, brought_up
 
 FULL_ITEMS = ("learner", "replay", "context")
 POLICY_ITEMS = ("policy",)
@@ -171,16 +172,15 @@ class CheckpointStore:
             check_resumable(meta["config"], config, self.directory.parent)
         if versions is not None:
             _warn_of_versions(self.directory / str(step), meta["versions"], versions)
-        wanted = {name: flatten(abstract[name]) for name in self.items}
-        self._check_arrays(step, wanted)
+        wanted = self._stored_arrays(step, {name: flatten(abstract[name]) for name in self.items})
         args = {
             name: ocp.args.StandardRestore({path: placed(leaf) for path, leaf in leaves.items()})
             for name, leaves in wanted.items()
             if leaves
         }
         found = self._read(step, args) if args else {}
-        trees = {name: unflatten(abstract[name], found.get(name) or {}) for name in self.items}
-        return trees, meta
+        leaves = {name: brought_up(found.get(name) or {}) for name in self.items}
+        return {name: unflatten(abstract[name], leaves[name]) for name in self.items}, meta
 
     def resume(
         self, abstract: Mapping[str, Any], config: Config, versions: Mapping[str, str | None]
@@ -273,8 +273,11 @@ class CheckpointStore:
         lines = reason.strip().splitlines() or ["unknown reason"]
         return DamagedCheckpoint(f"checkpoint {path} is damaged: {lines[0][:200]}", cure)
 
-    def _check_arrays(self, step: int, wanted: Mapping[str, Mapping[str, Any]]) -> None:
-        """Names the first array that the program and the checkpoint do not share."""
+    def _stored_arrays(
+        self, step: int, wanted: Mapping[str, Mapping[str, Any]]
+    ) -> dict[str, dict[str, Any]]:
+        """What to read for the arrays `wanted`; names the first one that the checkpoint lacks."""
+        stored = {}
         for item, leaves in wanted.items():
             path = self.directory / str(step) / item
             saved = {}
@@ -289,6 +292,7 @@ class CheckpointStore:
                 saved = metadata.tree
             elif leaves:
                 raise self._damaged(step, f"{item} is missing")
+            leaves = stored[item] = as_stored(leaves, saved)
             for name in sorted(leaves.keys() | saved.keys()):
                 old = describe(saved[name]) if name in saved else "absent"
                 new = describe(leaves[name]) if name in leaves else "absent"
@@ -297,6 +301,7 @@ class CheckpointStore:
                         f"checkpoint {path} does not fit: {name} is {old} there, {new} here",
                         "use the configuration and version that wrote it (versions.json)",
                     )
+        return stored
 
 
 def full_store(run: Path, keep: int | None = None, read_only: bool = False) -> CheckpointStore:

@@ -24,6 +24,7 @@ from checkpoint_fixtures import (
 
 from cmrl_jax import checkpoint
 from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.normalizers import init_obs_stats, init_return_stats
 
 
 def test_everything_comes_back_bit_for_bit(tmp_path, monkeypatch):
@@ -169,6 +170,55 @@ def test_an_array_that_does_not_fit_is_named(tmp_path, change, message):
         with pytest.raises(ConfigError) as raised:
             store.restore(abstract)
     assert message in raised.value.cause and "version" in raised.value.cure
+
+
+def old_statistics(values: np.ndarray) -> dict[str, dict[str, jax.Array]]:
+    """Of values (step, 3), as checkpoints held them that summed squared deviations."""
+    single = lambda x: jnp.asarray(x, jnp.float32)
+    total = np.square(values - values.mean(0)).sum(0)
+    mean, std, count = single(values.mean(0)), single(values.std(0)), len(values)
+    halves = {"count/hi": jnp.uint32(0), "count/lo": jnp.uint32(count)}
+    of_obs = {"mean": mean, "std": std, "std_eps": single(0.0), "summed_variance": single(total)}
+    of_returns = {"mean": mean, "count": jnp.full(3, count, jnp.float32), "m2": single(total)}
+    kept = {"returns": jnp.ones((3, 2)), "largest": single(np.abs(values).max(0))}
+    return {"obs_stats": of_obs | halves, "return_stats": of_returns | kept}
+
+
+def test_statistics_of_an_old_checkpoint_are_brought_up(tmp_path):
+    """Sums become the means that they stand for; a run goes on from them, a policy acts by them."""
+    values = np.random.default_rng(0).normal(5.0, [0.1, 1.0, 10.0], (1000, 3))
+    old = old_statistics(values)
+    current = {"obs_stats": init_obs_stats(3), "return_stats": init_return_stats(3, 2)}
+    with checkpoint.full_store(tmp_path) as store:
+        store.save({"learner": {"state": old}, "replay": None, "context": None}, make_meta(1))
+        abstract = jax.eval_shape(lambda: {"state": current})
+        trees, _ = store.restore({"learner": abstract, "replay": None, "context": None})
+    with checkpoint.policy_store(tmp_path) as store:
+        store.save({"policy": {"obs_stats": old["obs_stats"]}}, make_meta(1))
+        abstract = jax.eval_shape(lambda: {"obs_stats": current["obs_stats"]})
+        policy, _ = store.restore({"policy": abstract})
+    state = trees["learner"]["state"]
+    assert jax.tree.structure(state) == jax.tree.structure(current)
+    assert_equal_trees(policy["policy"]["obs_stats"], state["obs_stats"])
+    for stats in state.values():
+        assert int(stats.moments.count) == 1000
+        np.testing.assert_allclose(stats.moments.mean.value, values.mean(0), rtol=1e-6)
+        np.testing.assert_allclose(stats.moments.variance.value, values.var(0), rtol=1e-6)
+        assert not stats.moments.mean.rest.any() and not stats.moments.variance.rest.any()
+    np.testing.assert_array_equal(state["obs_stats"].std, old["obs_stats"]["std"])
+    for name in ("returns", "largest"):
+        np.testing.assert_array_equal(
+            getattr(state["return_stats"], name), old["return_stats"][name]
+        )
+
+
+def test_old_statistics_of_another_size_are_refused(tmp_path):
+    old = {"obs_stats": old_statistics(np.zeros((2, 3)))["obs_stats"]}
+    with checkpoint.policy_store(tmp_path) as store:
+        store.save({"policy": old}, make_meta(1))
+        abstract = jax.eval_shape(lambda: {"obs_stats": init_obs_stats(4)})
+        with pytest.raises(ConfigError, match=r"mean is float32\[3\] there, float32\[4\] here"):
+            store.restore({"policy": abstract})
 
 
 def test_other_package_versions_warn_in_one_line(tmp_path, capsys):

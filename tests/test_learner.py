@@ -288,8 +288,10 @@ def bootstrapping():
     def train(ring):
         state = learner.init(jax.random.key(0))
         scales = jnp.array([1.0, 5.0, 0.2])  # std of the returns: what rewards are divided by
-        stats = replace(state.return_stats, count=jnp.full(3, 100.0), m2=100.0 * scales**2)
-        state = replace(state, return_stats=stats)
+        moments = state.return_stats.moments
+        variance = replace(moments.variance, value=scales**2)
+        moments = replace(moments, variance=variance)
+        state = replace(state, return_stats=replace(state.return_stats, moments=moments))
         keys = jax.random.split(jax.random.key(1), 2000)
         metrics = jax.lax.scan(lambda s, k: learner.update(s, ring, ring, k), state, keys)[1]
         return jnp.mean(metrics["q_mean"][-100:], axis=0)  # (task,)

@@ -9,6 +9,7 @@ import pytest
 
 from cmrl_jax import normalizers
 from cmrl_jax.config import SacConfig
+from cmrl_jax.moments import Moments, UInt64
 
 TASKS, LANES, GAMMA = 3, 4, 0.9
 
@@ -53,7 +54,7 @@ def test_statistics_keep_their_accuracy_over_a_hundred_million_samples():
     stats, _ = jax.jit(lambda s, k: jax.lax.scan(add, s, k))(
         normalizers.init_obs_stats(2), jax.random.split(jax.random.key(0), 100)
     )
-    assert int(stats.count.lo) == 100_000_000
+    assert int(stats.moments.count) == 100_000_000
     np.testing.assert_allclose(stats.mean, [5.0, 0.0], atol=1e-2)
     np.testing.assert_allclose(stats.std, [2e-3, 1.0], rtol=2e-2)
 
@@ -89,9 +90,9 @@ def test_return_statistics_equal_a_loop_per_lane():
     values = returns_by_loop(reward, first)
     per_task = values.transpose(1, 0, 2).reshape(TASKS, -1)
     np.testing.assert_allclose(stats.returns, values[-1], rtol=1e-4)
-    np.testing.assert_allclose(stats.count, 60 * LANES)
-    np.testing.assert_allclose(stats.mean, per_task.mean(1), rtol=1e-4)
-    np.testing.assert_allclose(stats.m2, per_task.var(1) * 60 * LANES, rtol=1e-3)
+    assert int(stats.moments.count) == 60 * LANES
+    np.testing.assert_allclose(stats.moments.mean.value, per_task.mean(1), rtol=1e-4)
+    np.testing.assert_allclose(stats.moments.variance.value, per_task.var(1), rtol=1e-3)
     np.testing.assert_allclose(stats.largest, np.abs(per_task).max(1), rtol=1e-5)
 
     sac = SacConfig(return_max=10.0)
@@ -115,7 +116,7 @@ def test_the_largest_return_bounds_a_task_without_spread():
     stats = normalizers.update_return_stats(
         normalizers.init_return_stats(1, 2), reward, jnp.ones((1, 1, 2), bool), GAMMA
     )
-    assert float(stats.m2[0]) == 0.0
+    assert float(stats.moments.variance.value[0]) == 0.0
     np.testing.assert_allclose(normalizers.reward_denominator(stats, SacConfig()), [2.0])
 
 
@@ -137,8 +138,77 @@ def test_return_statistics_do_not_depend_on_the_chunks(cuts: list[int]):
         stop = start + length
         stats = update(stats, reward[start:stop], first[start:stop], GAMMA)
         start = stop
-    for name in ("returns", "count", "mean", "m2", "largest"):
-        np.testing.assert_allclose(getattr(stats, name), getattr(whole, name), rtol=1e-6)
+    for cut, uncut in zip(jax.tree.leaves(stats), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(cut, uncut)
+
+
+def after_many(count: int, mean: float, variance: float, size: int) -> Moments:
+    """The moments of `count` values, too many to be added here."""
+    high, low = divmod(count, 2**32)
+    started = normalizers.init_obs_stats(size).moments
+    return dataclasses.replace(
+        started,
+        count=UInt64(hi=high, lo=low),
+        mean=dataclasses.replace(started.mean, value=jnp.full(size, mean)),
+        variance=dataclasses.replace(started.variance, value=jnp.full(size, variance)),
+    )
+
+
+def assert_moments(moments: Moments, before: Moments, values: np.ndarray) -> None:
+    """Count and change of the moments by values (value, size), against numpy in float64."""
+    count, new = int(before.count), len(values)
+    mean, variance = float(before.mean.value[0]), float(before.variance.value[0])
+    values = values.astype(np.float64)
+    share = new / (count + new)
+    shift = values.mean(0) - mean
+    spread = values.var(0) + np.square(shift) * (1 - share)
+    assert int(moments.count) == count + new
+    pairs = (
+        (moments.mean, mean, share * shift),
+        (moments.variance, variance, share * (spread - variance)),
+    )
+    for found, start, change in pairs:
+        exact = np.asarray(found.value, np.float64) + np.asarray(found.rest, np.float64)
+        np.testing.assert_allclose(exact - start, change, rtol=1e-2)
+        np.testing.assert_allclose(found.value, start + change, rtol=2e-7)
+
+
+# What float32 counts to exactly, where it has lost most of a step, and beyond 32 bits.
+LONG = (2**24 - 1000, 2**28, 2**33)
+
+
+def rare_values(steps: int, seed: int) -> np.ndarray:
+    """(value, 2), few of them large: mean 2, variance 196.
+
+    Rounded into a single float32, only the large ones would count after 2^24 steps.
+    """
+    large = np.random.default_rng(seed).random((steps, 2)) < 0.02
+    return np.where(large, 100.0, 0.0).astype(np.float32)
+
+
+@pytest.mark.parametrize("count", LONG)
+def test_returns_of_one_lane_are_right_however_long_the_run(count: int):
+    values = rare_values(2**16, seed=3)
+    stats = normalizers.init_return_stats(2, 1)
+    stats = dataclasses.replace(stats, moments=after_many(count, 2.0, 196.0, 2))
+    reward = jnp.asarray(values)[..., None]  # (time, task, lane)
+    first = jnp.ones(reward.shape, bool)  # a step's return is its reward
+    after = jax.jit(normalizers.update_return_stats)(stats, reward, first, GAMMA)
+    assert_moments(after.moments, stats.moments, values)
+    np.testing.assert_allclose(
+        normalizers.reward_denominator(after, SacConfig(return_max=1e9)), 14.0, rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("count", LONG)
+def test_observations_of_one_lane_are_right_however_long_the_run(count: int):
+    values = rare_values(2**16, seed=4)
+    moments = after_many(count, 2.0, 196.0, 2)
+    stats = dataclasses.replace(normalizers.init_obs_stats(2), moments=moments)
+    add = lambda stats, obs: (normalizers.update_obs_stats(stats, obs), None)
+    after, _ = jax.jit(lambda s, x: jax.lax.scan(add, s, x))(stats, jnp.asarray(values)[:, None])
+    assert_moments(after.moments, moments, values)
+    np.testing.assert_allclose(after.std, 14.0, rtol=1e-3)
 
 
 def test_updates_keep_types_so_that_a_scan_can_carry_them():

@@ -76,7 +76,7 @@ ROWS = (
         "config_io",
         "inspection_file",
     },
-    {"goal_files", "pca"},
+    {"goal_files", "pca", "moments", "old_statistics"},
     {"manifest", "named_arrays", "parallel"},
     {"validate"},
     {"config", "commands"},
