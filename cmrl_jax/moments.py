@@ -10,10 +10,31 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-
-import envs.quiet_mjx  # noqa: F401  # isort: skip, brax imports mjx
-from brax.training.types import UInt64
 from flax import struct
+
+
+@struct.dataclass
+class Count:
+    """A whole number of 64 bits, which jax lacks by default: two halves, each () uint32."""
+
+    hi: jax.Array
+    lo: jax.Array
+
+    @classmethod
+    def of(cls, number: int) -> Count:
+        return cls(*(jnp.asarray(half, jnp.uint32) for half in divmod(number, 2**32)))
+
+    def plus(self, number: int) -> Count:
+        """The sum with a number below 2^32."""
+        lo = self.lo + jnp.uint32(number)
+        return Count(self.hi + (lo < self.lo).astype(jnp.uint32), lo)
+
+    def as_float(self) -> jax.Array:
+        """The nearest float32 number."""
+        return self.hi.astype(jnp.float32) * 2.0**32 + self.lo.astype(jnp.float32)
+
+    def __int__(self) -> int:
+        return int(self.hi) * 2**32 + int(self.lo)
 
 
 @struct.dataclass
@@ -34,7 +55,7 @@ class Moments:
         variance: (...), mean of the squared deviations.
     """
 
-    count: UInt64
+    count: Count
     mean: Mean
     variance: Mean
 
@@ -42,7 +63,7 @@ class Moments:
 def init_moments(shape: tuple[int, ...]) -> Moments:
     """Of no value at all."""
     zero = Mean(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
-    return Moments(UInt64(hi=0, lo=0), zero, zero)
+    return Moments(Count.of(0), zero, zero)
 
 
 def add_values(moments: Moments, number: int, shift: jax.Array, variance: jax.Array) -> Moments:
@@ -54,8 +75,8 @@ def add_values(moments: Moments, number: int, shift: jax.Array, variance: jax.Ar
             themselves, so that a small spread around a large mean is not lost.
         variance: (...) of the batch around its own mean.
     """
-    count = moments.count + number
-    batches = (jnp.float32(count.hi) * 2.0**32 + jnp.float32(count.lo)) / number  # of that size
+    count = moments.count.plus(number)
+    batches = count.as_float() / number  # of that size
     spread = variance + rounded(jnp.square(shift) * (1.0 - 1.0 / batches))
     return Moments(
         count=count,

@@ -12,6 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from cmrl_jax.moments import Count
+
 Leaves = dict[str, Any]
 
 # Array that only the old form has -> all that stood where `_NEW` is now.
@@ -59,7 +61,7 @@ def brought_up(found: Mapping[str, Any]) -> Leaves:
             total = old["m2"]
         else:
             halves = old["count/hi"], old["count/lo"]
-            count = halves[0].astype(jnp.float32) * 2.0**32 + halves[1].astype(jnp.float32)
+            count = Count(*halves).as_float()
             total = old["summed_variance"]
         variance = total / jnp.maximum(count, 1.0)
         rest = jnp.zeros_like(total), jnp.zeros_like(total)  # a buffer each, to be donated

@@ -9,7 +9,7 @@ import pytest
 
 from cmrl_jax import normalizers
 from cmrl_jax.config import SacConfig
-from cmrl_jax.moments import Moments, UInt64
+from cmrl_jax.moments import Count, Moments
 
 TASKS, LANES, GAMMA = 3, 4, 0.9
 
@@ -144,11 +144,10 @@ def test_return_statistics_do_not_depend_on_the_chunks(cuts: list[int]):
 
 def after_many(count: int, mean: float, variance: float, size: int) -> Moments:
     """The moments of `count` values, too many to be added here."""
-    high, low = divmod(count, 2**32)
     started = normalizers.init_obs_stats(size).moments
     return dataclasses.replace(
         started,
-        count=UInt64(hi=high, lo=low),
+        count=Count.of(count),
         mean=dataclasses.replace(started.mean, value=jnp.full(size, mean)),
         variance=dataclasses.replace(started.variance, value=jnp.full(size, variance)),
     )

@@ -76,8 +76,8 @@ ROWS = (
         "config_io",
         "inspection_file",
     },
-    {"goal_files", "pca", "moments", "old_statistics"},
-    {"manifest", "named_arrays", "parallel"},
+    {"goal_files", "pca", "old_statistics"},
+    {"manifest", "named_arrays", "parallel", "moments"},
     {"validate"},
     {"config", "commands"},
 )
