@@ -16,7 +16,7 @@ from typing import Any
 
 from cmrl_jax.config import ConfigError
 from cmrl_jax.evaluate_flags import EvalOptions
-from cmrl_jax.locks import hold
+from cmrl_jax.locks import lock
 
 FIGURES = {
     "success_any": "success_any",
@@ -77,11 +77,13 @@ class CellTable:
             return
         try:
             self._file = open(path, "a+b", buffering=0)
-            if not hold(self._file, path):
-                cause = f"another process is writing to {path}"
-                raise ConfigError(cause, "let it end first, or give --csv another file")
+            lock(self._file, str(path))
             self._file.seek(0)
             self._go_on(path, self._file.read(), force)
+        except BlockingIOError as error:
+            self.close()
+            cause = f"another process is writing to {path}"
+            raise ConfigError(cause, "let it end first, or give --csv another file") from error
         except OSError as error:
             raise self._refused(error) from error
         except ConfigError:

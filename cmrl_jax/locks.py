@@ -10,24 +10,25 @@ import fcntl
 import sys
 from typing import IO, Any
 
-WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
+NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
 
 
-def hold(file: IO[Any], name: object) -> bool:
-    """Takes the lock of an open file; False where another process holds it.
+def lock(file: IO[Any], what: str) -> None:
+    """Locks a file until it is closed; only warns where the file system has no locks.
 
-    On a file system without locks: True, after a line of warning that names what is not guarded.
+    Args:
+        what: is kept from other processes, in words.
 
     Raises:
-        OSError: the system refuses for another reason.
+        BlockingIOError: another process holds the lock.
     """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
     except OSError as error:
-        if error.errno not in WITHOUT_LOCKS:
+        if error.errno not in NO_LOCKS:
             raise
-        cause = f"the file system of {name} has no locks ({error.strerror})"
-        print(f"warning: {cause}: do not let a second process write to it", file=sys.stderr)
-    return True
+        print(
+            f"warning: {what} is on a file system without locks ({error.strerror}): "
+            "take care that no other process writes to it",
+            file=sys.stderr,
+        )

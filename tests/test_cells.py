@@ -140,7 +140,7 @@ def test_a_file_system_without_locks_is_warned_of(path, monkeypatch, capsys, num
     with CellTable(path) as table:
         table.add(ROWS)
     [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith("warning: ") and str(path) in line and "no locks" in line
+    assert line.startswith("warning: ") and str(path) in line and "without locks" in line
 
 
 def test_a_disk_that_refuses_a_row_is_two_lines():
