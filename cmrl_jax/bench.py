@@ -9,7 +9,6 @@ of the main job.
 from __future__ import annotations
 
 import datetime
-import json
 import os
 import subprocess
 import sys
@@ -25,11 +24,12 @@ from cmrl_jax import bench_physics, bench_stages
 from cmrl_jax.bench_physics import best_seconds
 from cmrl_jax.collect import init_run
 from cmrl_jax.commands import CHILD
-from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config import Config, ConfigError, call_envs
 from cmrl_jax.config_io import load_config
 from cmrl_jax.metrics import package_versions
 from cmrl_jax.replay import Transition, add
 from cmrl_jax.session import Session, prepare_jax
+from envs.outputs import write_json
 from envs.sawyer import ACTION_SIZE, OBS_SIZE
 
 CONFIG = "ml4.yaml"
@@ -52,7 +52,7 @@ class Report:
 
     def add(self, name: str, value: float, unit: str, **labels: Any) -> None:
         self._document["rows"].append({"name": name, "value": value, "unit": unit} | labels)
-        self._path.write_text(json.dumps(self._document, indent=2) + "\n", encoding="utf-8")
+        call_envs(lambda: write_json(self._path, "bench", self._document))
         shown = " ".join(f"{key}={label}" for key, label in labels.items())
         print(f"{name:<30} {value:>10.1f} {unit:<8} {shown}", flush=True)
 

@@ -21,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from cmrl_jax.cells import CellTable
 from cmrl_jax.commands import CHILD
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import EvalOptions
-from cmrl_jax.scores import ScoreCsv, cell_rows, of_policy
+from cmrl_jax.scores import cell_rows, of_policy
 from cmrl_jax.session import Session
 from cmrl_jax.targets import Target, columns_of, load_target
 from cmrl_jax.trials import trial_of
@@ -33,7 +34,7 @@ COMMANDS = 2  # calls of `eval` that are timed: each takes seconds to start
 
 
 def time_one_by_one(
-    targets: Sequence[Target], options: EvalOptions, table: ScoreCsv, count: int
+    targets: Sequence[Target], options: EvalOptions, table: CellTable, count: int
 ) -> dict[str, Any]:
     """Scores `count` lanes, spread evenly over the sweep's, each by a call of its own.
 

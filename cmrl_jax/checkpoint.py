@@ -314,8 +314,8 @@ def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
     return CheckpointStore(run / "policy", POLICY_ITEMS, None, read_only)
 
 
-def policy_digest(run: Path, step: int) -> str | None:
-    """What tells a policy checkpoint from another of its name; None without its list of files."""
+def policy_digest(run: Path, step: int) -> str:
+    """What tells a policy checkpoint from another of its name."""
     return fingerprint(run / "policy" / str(step))
 
 

@@ -27,7 +27,7 @@ from cmrl_jax.config_io import (
     resolve,
     to_yaml,
 )
-from cmrl_jax.flags import Parser, names, parse, parser_of, shown, writable
+from cmrl_jax.flags import Parser, add_force, distinct, names, parse, parser_of, shown, writable
 from cmrl_jax.goal_files import find_table
 from cmrl_jax.run_dir import (
     config_stem,
@@ -39,6 +39,7 @@ from cmrl_jax.run_dir import (
 )
 from cmrl_jax.stop import StopSignal
 from envs.command_line import typed_path
+from envs.outputs import written_by
 
 COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "goals")
 
@@ -156,6 +157,8 @@ def _plot(words: list[str]) -> int:
     inspected, out = args.run if args.inspect else (), args.out or args.run[0] / "plots"
     for run in inspected:
         plot_flags.check_inspectable(run)
+    for name in plot_flags.PICTURES:
+        writable(out / name, "--out", written_by("plot"), args.force)
 
     from cmrl_jax import plots
 
@@ -181,12 +184,13 @@ def bench_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--json", type=typed_path, default=Path("bench.json"), metavar="F", help="[bench.json]"
     )
+    add_force(parser)
     return parser
 
 
 def _bench(words: list[str]) -> int:
     args = parse(bench_parser(), words)
-    writable(args.json)
+    writable(args.json, "--json", written_by("bench"), args.force)
 
     from cmrl_jax import bench
 
@@ -218,11 +222,12 @@ def _finetune(words: list[str]) -> int:
     args = parse(finetune_flags.add_flags(parser), words)
     options, run = finetune_flags.options_of(args), find_run(args.run)
     finetune_flags.check_run(resolve(*read_yaml(run / "config.yaml")), options)
-    writable(args.json)
+    distinct(json=args.json, figure=args.figure)
+    writable(args.json, "--json", written_by("finetune"), args.force)
     if args.figure is not None:
         from cmrl_jax import plots
 
-        plots.check_figure(args.figure)
+        plots.check_figure(args.figure, "finetune", args.force)
 
     from cmrl_jax import finetune_cli
 

@@ -8,6 +8,7 @@ Preset values and their sources: algorithm.md section 9 (see the comments in `co
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 from collections.abc import Callable, Iterator
@@ -38,8 +39,15 @@ class ConfigError(ValueError):
 
 def call_envs(build: Callable[[], Any]) -> Any:
     """Calls into `envs`, whose ValueErrors carry cause and cure on two lines."""
-    try:
+    with as_config_error():
         return build()
+
+
+@contextlib.contextmanager
+def as_config_error() -> Iterator[None]:
+    """Such errors as ConfigErrors."""
+    try:
+        yield
     except ValueError as error:
         cause, _, cure = str(error).partition("\n")
         if not cure:

@@ -94,13 +94,17 @@ class Evaluator:
     def compile(self, params: PolicyParams, text_width: int) -> None:
         """Compiles the episode for one policy's parameter shapes; later calls do not compile."""
         if self._compiled is None:
-            shape = (self.policies, self.lanes)
-            text, zero = np.zeros((*shape, text_width), np.float32), np.zeros(self.lanes, np.int32)
-            lanes = Lanes(zero, zero, zero, np.zeros((self.lanes, 3), np.float32))
-            source = ZSource(self._empty(self.lanes), text, np.zeros(shape, np.float32))
-            stacked = _stack([params] * self.policies)
-            args = (stacked, source.belief, text, source, lanes, np.bool_(True), jax.random.key(0))
-            self._compiled = self._episode.lower(*args).compile()
+            self._compiled = self.traced(params, text_width).lower().compile()
+
+    def traced(self, params: PolicyParams, text_width: int) -> Any:
+        """The episode as jax traces it for one policy's parameter shapes."""
+        shape = (self.policies, self.lanes)
+        text, zero = np.zeros((*shape, text_width), np.float32), np.zeros(self.lanes, np.int32)
+        lanes = Lanes(zero, zero, zero, np.zeros((self.lanes, 3), np.float32))
+        source = ZSource(self._empty(self.lanes), text, np.zeros(shape, np.float32))
+        stacked = _stack([params] * self.policies)
+        args = (stacked, source.belief, text, source, lanes, np.bool_(True), jax.random.key(0))
+        return self._episode.trace(*args)
 
     def memory_bytes(self) -> int:
         """Memory that the compiled episode needs beside its arguments, in bytes; 0: unknown."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
+from cmrl_jax.cells import CellTable, Row
+from cmrl_jax.config import call_envs
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
-from cmrl_jax.scores import ScoreCsv, cell_rows, format_scores, of_policy, summarise
+from cmrl_jax.scores import cell_rows, format_scores, of_policy, summarise
 from cmrl_jax.session import Session, load_policy, prepare_jax
 from cmrl_jax.settings import describe, result_fields, row_columns
 from cmrl_jax.trials import batch_lanes, evaluation_config, lane_budget, trial_of
+from envs.outputs import write_json
 
 
 def evaluate_run(
@@ -19,19 +22,36 @@ def evaluate_run(
     checkpoint: int | None,
     json_path: Path | None,
     csv_path: Path | None,
+    force: bool,
 ) -> int:
     """Scores a run's policy, prints a table, writes JSON and CSV; returns the exit code.
 
     Args:
         checkpoint: iteration; None for the newest.
+        csv_path: gone on with where it is there.
+        force: begin a CSV anew that is no table of cells.
 
     Raises:
-        ConfigError: no such checkpoint, or it does not fit this program.
+        ConfigError: no such checkpoint, or it does not fit this program; a CSV that cannot be gone
+            on with.
     """
+    evaluate = _evaluate
     if options.physics == "metaworld":
-        from cmrl_jax.evaluate_metaworld import evaluate_in_metaworld
+        from cmrl_jax.evaluate_metaworld import evaluate_in_metaworld as evaluate
+    with CellTable(csv_path, force) as table:  # held throughout, as by a sweep
+        result, rows = evaluate(run, options, checkpoint)
+        new = table.add(rows)
+        if csv_path is not None:
+            print(f"{csv_path}: {len(new)} rows added, {len(rows) - len(new)} were there")
+    if json_path is not None:
+        call_envs(lambda: write_json(json_path, "eval", result))
+    return 0
 
-        return evaluate_in_metaworld(run, options, checkpoint, json_path, csv_path)
+
+def _evaluate(
+    run: Path, options: EvalOptions, checkpoint: int | None
+) -> tuple[dict[str, Any], list[Row]]:
+    """Scores a policy in one of our backends: the result as JSON has it, and the cells."""
     config = evaluation_config(run, options.physics)
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
@@ -46,10 +66,5 @@ def evaluate_run(
     summary = summarise(scores, tasks)
     print(f"checkpoint {policy.meta['iteration']} of {run}: {describe(options, config)}")
     print(format_scores(summary))
-    if csv_path is not None:
-        with ScoreCsv(csv_path, resume=False) as table:
-            table.add(cell_rows(scores, tasks, row_columns(run, policy.meta, options, config)))
-    if json_path is not None:
-        result = {"tasks": summary} | result_fields(run, policy.meta, options, config)
-        json_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    return 0
+    result = {"tasks": summary} | result_fields(run, policy.meta, options, config)
+    return result, cell_rows(scores, tasks, row_columns(run, policy.meta, options, config))

@@ -17,6 +17,8 @@ from cmrl_jax.config import MOST_EPISODES, TASKS, Config, ConfigError, suggest
 from cmrl_jax.config_io import read_yaml, resolve
 from cmrl_jax.flags import (
     adaptation,
+    add_force,
+    distinct,
     goal_count,
     list_of,
     names,
@@ -32,6 +34,7 @@ from cmrl_jax.run_dir import find_run, holds_run
 from cmrl_jax.validate import check_goal_set
 from envs.command_line import brief, typed_path, what_is, whole
 from envs.goal_names import GOALS
+from envs.outputs import written_by
 
 Z_SOURCES = ("posterior", "prior", "shuffled", "other", "text")
 DONATED = ("shuffled", "other")  # z from another lane's belief: lanes depend on one another
@@ -87,6 +90,7 @@ class EvalOptions:
 def _parser(command: str, description: str) -> argparse.ArgumentParser:
     """A parser with the flags of the protocol."""
     parser = parser_of(command, description)
+    add_force(parser)
     protocol = parser.add_argument_group("protocol")
     add = protocol.add_argument
     add(
@@ -148,7 +152,7 @@ def eval_parser() -> argparse.ArgumentParser:
     add("--run", metavar="DIR", type=typed_path, required=True, help="run directory")
     add("--checkpoint", type=natural, metavar="N", help="iteration of the checkpoint [the last]")
     add("--json", type=typed_path, metavar="F", help="write the figures to this file")
-    add("--csv", type=typed_path, metavar="F", help="write one row a task, goal, draw and k")
+    add("--csv", type=typed_path, metavar="F", help="add to this table: a row a goal, draw and k")
     own = parser.add_argument_group("Meta-World's own function, with --physics metaworld")
     for name, low, default in (("adaptation", 0, 10), ("evaluation", 1, 3)):
         text = f"its {name} episodes [{default}]"
@@ -214,9 +218,6 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
     if args.physics == "metaworld" and args.z in DONATED:
         cause = f"--z {args.z} with --physics metaworld, where lanes know nothing of each other"
         raise ConfigError(cause, "use --z posterior, prior or text, or --physics native")
-    if args.physics == "metaworld" and args.lanes is not None:
-        cause = "--lanes with --physics metaworld, whose environments are stepped in tens"
-        raise ConfigError(cause, "leave it out, or use --physics native")
     own = {}
     for name in ("adaptation_episodes", "evaluation_episodes"):
         if (value := getattr(args, name, None)) is not None:
@@ -331,13 +332,21 @@ def checkpoint_choice(text: str) -> tuple[int, ...] | Literal["all", "last"]:
     return chosen
 
 
+def _check_outputs(args: argparse.Namespace, command: str) -> None:
+    """Whether `--json` and `--csv` may be written; the table's rows are read when it is opened."""
+    from cmrl_jax.cells import MARK
+
+    distinct(json=args.json, csv=args.csv)
+    writable(args.json, "--json", written_by(command), args.force)
+    writable(args.csv, "--csv", MARK, args.force)
+
+
 def run_eval(words: Sequence[str]) -> int:
     """The command `eval`; returns the exit code."""
     args = parse(eval_parser(), words)
     options = options_of(args)
     check_run(options, args.run)
-    writable(args.json)
-    writable(args.csv, "--csv")
+    _check_outputs(args, "eval")
 
     from cmrl_jax import evaluate_cli
 
@@ -347,6 +356,7 @@ def run_eval(words: Sequence[str]) -> int:
         checkpoint=args.checkpoint,
         json_path=args.json,
         csv_path=args.csv,
+        force=args.force,
     )
 
 
@@ -361,8 +371,7 @@ def run_sweep(words: Sequence[str]) -> int:
     runs = find_runs(args.runs)
     for run in runs:
         check_run(options, run)
-    writable(args.json)
-    writable(args.csv, "--csv")
+    _check_outputs(args, "sweep")
 
     from cmrl_jax import sweep
 
@@ -372,5 +381,6 @@ def run_sweep(words: Sequence[str]) -> int:
         options=options,
         json_path=args.json,
         csv_path=args.csv,
+        force=args.force,
         compare=args.compare,
     )

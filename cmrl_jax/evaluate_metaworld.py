@@ -13,7 +13,6 @@ A run's own training process never comes here: this is a command of its own.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,13 +24,14 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 from metaworld.evaluation import Timestep, metalearning_evaluation
 
+from cmrl_jax.cells import Row
 from cmrl_jax.config import ConfigError
 from cmrl_jax.episode import Episode
 from cmrl_jax.evaluate import Trial, lane_names
 from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
 from cmrl_jax.metaworld_agent import MetaWorldAgent
 from cmrl_jax.metrics import format_duration
-from cmrl_jax.scores import ScoreCsv, cell_rows, format_scores, summarise
+from cmrl_jax.scores import cell_rows, format_scores, summarise
 from cmrl_jax.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.settings import describe, horizon_of, result_fields, row_columns
 from cmrl_jax.trials import evaluation_config, trial_of
@@ -41,13 +41,9 @@ ENVIRONMENTS = 10  # side by side in our own protocol: 18 MB each, and one call 
 
 
 def evaluate_in_metaworld(
-    run: Path,
-    options: EvalOptions,
-    checkpoint: int | None,
-    json_path: Path | None,
-    csv_path: Path | None,
-) -> int:
-    """Scores a run's policy, prints both tables, writes JSON and CSV; returns the exit code.
+    run: Path, options: EvalOptions, checkpoint: int | None
+) -> tuple[dict[str, Any], list[Row]]:
+    """Scores a run's policy and prints both tables; returns the result as JSON has it, and cells.
 
     Raises:
         ConfigError: no such checkpoint, or an episode longer than Meta-World's.
@@ -69,7 +65,7 @@ def evaluate_in_metaworld(
     for row, task in enumerate(tasks):
         started = time.monotonic()
         alone = of_task(trial, row)
-        parts.append(k_shot(session, policy, alone, k, horizon, options.seed))
+        parts.append(k_shot(session, policy, alone, k, horizon, options.seed, options.lanes))
         own[task] = metaworlds_own(session, policy, alone, options, horizon)
         seconds = format_duration(time.monotonic() - started)
         print(
@@ -82,14 +78,9 @@ def evaluate_in_metaworld(
     print(f"checkpoint {policy.meta['iteration']} of {run}: {describe(options, config)}")
     print(format_scores(summary))
     print(format_own(own))
-    if csv_path is not None:
-        with ScoreCsv(csv_path, resume=False) as table:
-            table.add(cell_rows(scores, tasks, row_columns(run, policy.meta, options, config)))
-    if json_path is not None:
-        fields = result_fields(run, policy.meta, options, config)
-        result = {"tasks": summary, "metalearning_evaluation": {"tasks": own}} | fields
-        json_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    return 0
+    fields = result_fields(run, policy.meta, options, config)
+    result = {"tasks": summary, "metalearning_evaluation": {"tasks": own}} | fields
+    return result, cell_rows(scores, tasks, row_columns(run, policy.meta, options, config))
 
 
 def of_task(trial: Trial, row: int) -> Trial:
@@ -104,17 +95,26 @@ def of_task(trial: Trial, row: int) -> Trial:
 
 
 def k_shot(
-    session: Session, policy: Policy, trial: Trial, k: Sequence[int], horizon: int, seed: int
+    session: Session,
+    policy: Policy,
+    trial: Trial,
+    k: Sequence[int],
+    horizon: int,
+    seed: int,
+    environments: int | None = None,
 ) -> dict[int, Episode]:
     """Our protocol on a trial of one task: k -> Episode of (1, goal, draw).
 
-    Batches of `ENVIRONMENTS` lanes (goal, draw), each at its goal throughout.
+    Batches of `environments` lanes (goal, draw), each at its goal throughout.
+
+    Args:
+        environments: side by side; None for `ENVIRONMENTS`.
     """
     [task] = trial.tasks
     goals, draws = trial.placements.shape[1], trial.draws
     goal, _ = (x.ravel() for x in np.indices((goals, draws)))
     placements = trial.placements[0][goal]
-    lanes = min(ENVIRONMENTS, len(goal))
+    lanes = min(environments or ENVIRONMENTS, len(goal))
     shown = session.config.env.goal_observable
     parts: dict[int, list[Episode]] = {n: [] for n in k}
     envs = make_vector_env(task, placements[:lanes], lanes, horizon, shown, seed)
@@ -166,8 +166,11 @@ def agent_of(
 def format_own(own: dict[str, Any]) -> str:
     """The output of Meta-World's own function, a line a task."""
     [first, *_] = own.values()
+    goals = f"{first['num_evals'] // first['draws']} goals"
+    if first["draws"] > 1:
+        goals += f", {first['draws']} runs each"
     lines = [
-        f"metaworld.evaluation.metalearning_evaluation: {first['num_evals']} goals, "
+        f"metaworld.evaluation.metalearning_evaluation: {goals}, "
         f"{first['adaptation_episodes']} adaptation and {first['evaluation_episodes']} evaluation "
         f"episodes of {first['horizon']} steps, ended by success"
     ]
@@ -213,18 +216,18 @@ def metaworlds_own(
 ) -> dict[str, Any]:
     """What Meta-World's `metalearning_evaluation` says of the policy on a trial of one task."""
     [task] = trial.tasks
-    goals = trial.placements.shape[1]
+    placements = np.repeat(trial.placements[0], trial.draws, axis=0)  # a goal once for each draw
     shown = session.config.env.goal_observable
-    envs = make_vector_env(task, trial.placements[0], 1, horizon, shown, options.seed)
+    envs = make_vector_env(task, placements, 1, horizon, shown, options.seed)
     # Goals come in the environment's own order: runs are numbered, sentences taken in turn.
-    runs = [np.array([n]) for n in range(goals)]
-    agent = agent_of(session, policy, replace(trial, draws=1), runs, horizon, options.seed)
+    runs = [np.array([n]) for n in range(len(placements))]
+    agent = agent_of(session, policy, trial, runs, horizon, options.seed)
     episodes = options.adaptation_episodes if session.learner.inference else 0
     try:
         rate, mean_return, per_task = metalearning_evaluation(
             agent,
             envs,
-            num_evals=goals,
+            num_evals=len(placements),
             adaptation_steps=1,
             adaptation_episodes=episodes,
             evaluation_episodes=options.evaluation_episodes,
@@ -235,7 +238,8 @@ def metaworlds_own(
         "mean_success_rate": float(rate),
         "mean_return": float(mean_return),
         "success_rate_per_task": {name: float(value) for name, value in per_task.items()},
-        "num_evals": goals,
+        "num_evals": len(placements),
+        "draws": trial.draws,
         "adaptation_steps": 1,
         "adaptation_episodes": episodes,
         "evaluation_episodes": options.evaluation_episodes,

@@ -13,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 
 from cmrl_jax.config import ConfigError
+from envs.outputs import replacing, written_by
 from envs.render import Renderer, camera_of, metaworld_scene
 
 CONTROL_RATE = 80  # control steps a second: 5 substeps of 2.5 ms
@@ -96,6 +98,7 @@ def write_video(film: Film, camera: Camera, every: int, path: Path) -> None:
 
     Raises:
         ConfigError: ffmpeg cannot write the file.
+        ValueError: it cannot take the place of `path` (two lines: cause, cure).
     """
     from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -103,9 +106,10 @@ def write_video(film: Film, camera: Camera, every: int, path: Path) -> None:
     size, rate = f"{WIDTH}x{HEIGHT + STRIP}", str(CONTROL_RATE / every)
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", rate, "-i", "-"]
     made = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "23", "-movflags", "+faststart"]
-    command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *given, *made, str(path)]
-    with tempfile.TemporaryFile() as errors:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=errors)
+    made += ["-metadata", f"comment={written_by('render')}"]
+    command = [get_ffmpeg_exe(), "-y", "-loglevel", "error", *given, *made]
+    with tempfile.TemporaryFile() as errors, replacing(path) as part:
+        process = subprocess.Popen([*command, str(part)], stdin=subprocess.PIPE, stderr=errors)
         assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError), process.stdin as pipe:
             for episode in film.episodes:
@@ -154,4 +158,7 @@ def write_sheet(film: Film, camera: Camera, path: Path) -> None:
             box = draw.textbbox((corner[0] + 6, corner[1] + 4), text, font)
             draw.rectangle((box[0] - 3, box[1] - 3, box[2] + 3, box[3] + 3), "black")
             draw.text((corner[0] + 6, corner[1] + 4), text, color, font)
-    sheet.save(path, optimize=True)
+    text = PngInfo()
+    text.add_text("Software", written_by("render"))
+    with replacing(path) as part:
+        sheet.save(part, optimize=True, pnginfo=text)

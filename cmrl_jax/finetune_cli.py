@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from cmrl_jax.checkpoint import full_store, join_run, split_run
 from cmrl_jax.collect import init_run
-from cmrl_jax.config import Config
+from cmrl_jax.config import Config, call_envs
 from cmrl_jax.config_io import read_yaml, resolve
 from cmrl_jax.finetune import (
     FineTuning,
@@ -27,6 +26,7 @@ from cmrl_jax.learner import TrainState
 from cmrl_jax.metrics import package_versions
 from cmrl_jax.scores import fault_warning
 from cmrl_jax.session import Session, prepare_jax
+from envs.outputs import write_json
 
 Curves = dict[str, dict[int, Score]]
 
@@ -73,7 +73,7 @@ def finetune_run(
         if json_path is not None:  # after each way: a stopped command keeps what it has
             result = as_json(curves) | asdict(options) | {"run": run.as_posix()}
             result |= {"iteration": meta["iteration"], "versions": package_versions()}
-            json_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+            call_envs(lambda: write_json(json_path, "finetune", result))
     if figure is not None:
         from cmrl_jax.plots import plot_adaptation
 

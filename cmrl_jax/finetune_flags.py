@@ -6,7 +6,7 @@ import argparse
 from dataclasses import dataclass
 
 from cmrl_jax.config import MOST_EPISODES, MOST_UPDATES, TASKS, Config, ConfigError, suggest
-from cmrl_jax.flags import goal_count, names, seed
+from cmrl_jax.flags import add_force, goal_count, names, seed
 from cmrl_jax.validate import check_goal_set
 from envs.command_line import typed_path, whole
 from envs.goal_names import GOALS
@@ -65,6 +65,7 @@ def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     add("--physics", choices=("mjx", "native"), metavar="P", help="mjx, native [the run's own]")
     add("--json", type=typed_path, metavar="F", help="write the figures to this file")
     add("--figure", type=typed_path, metavar="F", help="draw the curves to this PNG")
+    add_force(parser)
     return parser
 
 

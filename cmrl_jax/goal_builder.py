@@ -6,7 +6,6 @@ byte. `goals.py` reads it.
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,10 +13,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from cmrl_jax.config import TEXT_ENCODERS, ConfigError
+from cmrl_jax.config import TEXT_ENCODERS, ConfigError, call_envs
 from cmrl_jax.encoders import Encoder, file_sha256, find_encoder
+from cmrl_jax.flags import writable
 from cmrl_jax.goal_files import PROMPTS_FILE, table_path
 from cmrl_jax.goals import GoalTable, read_table
+from envs.outputs import replacing
 
 
 def read_prompts(path: Path = PROMPTS_FILE) -> dict[str, dict[str, list[str]]]:
@@ -78,6 +79,8 @@ def build(
     if encoder not in TEXT_ENCODERS:
         raise ConfigError(f"unknown encoder {encoder!r}", f"use one of {', '.join(TEXT_ENCODERS)}")
     prompts = read_prompts(prompts_file)
+    # Whether it can be; whether it may be replaced, its encoder decides (`_check_replaceable`).
+    writable(out or table_path(encoder), "--out", encoder, force=True)
     found = find_encoder(encoder, weights)
     if out is None:
         if found.name != encoder:
@@ -100,11 +103,7 @@ def build(
         "tokenizer_sha256": np.array(found.tokenizer_sha256),
         "prompts_sha256": np.array(file_sha256(prompts_file)),
     }
-    try:
-        _write(out, tables)
-    except OSError as error:
-        cause = f"cannot write {out}: {error.strerror}"
-        raise ConfigError(cause, "give --out a file you may write to") from error
+    call_envs(lambda: _write(out, tables))
     return out
 
 
@@ -158,12 +157,9 @@ def _check_replaceable(out: Path, found: Encoder) -> None:
 
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
+    with replacing(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
         for key, array in sorted(arrays.items()):
             # np.savez stamps the time of day on each member; a fixed date keeps the file equal.
             entry = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
             with archive.open(entry, "w") as member:
                 np.lib.format.write_array(member, array)
-    os.replace(part, path)

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cmrl_jax.config import ConfigError
+from cmrl_jax.config import ConfigError, as_config_error
 from cmrl_jax.goal_builder import all_vectors, task_cosines
 from cmrl_jax.goals import GoalTable
 from cmrl_jax.pca import principal_axes
+from envs.outputs import save_figure
 
 
 def draw(table: GoalTable, out: Path) -> None:
@@ -59,11 +60,11 @@ def draw(table: GoalTable, out: Path) -> None:
     right.set_title(f"PCA of {table.encoder}")
     right.legend(fontsize=9)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=110)
-    except (OSError, ValueError) as error:  # ValueError: an ending that is no picture's
-        raise ConfigError(
-            f"cannot write {out}: {error}", "give --figure a .png you may write to"
-        ) from error
+        with as_config_error():
+            save_figure(figure, out, "goals", "--figure", dpi=110)
+    except ConfigError:
+        raise
+    except ValueError as error:  # an ending that is no picture's
+        raise ConfigError(f"cannot write {out}: {error}", "give --figure a .png") from error
     finally:
         pyplot.close(figure)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from cmrl_jax.flags import writable
+from cmrl_jax.flags import distinct
 from envs.command_line import typed_path
+from envs.outputs import FORCE_HELP
 
 DESCRIPTION = (
     "Makes the table of text vectors that `goals.table` names, from the sentences in "
@@ -34,7 +35,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         metavar="F",
         help="table to write or to look at [the packaged one]",
     )
-    add("--force", action="store_true", help="replace a table of another encoder")
+    add("--force", action="store_true", help=f"{FORCE_HELP}, or a table of another encoder")
     add("--show", action="store_true", help="print the cosines between the tasks")
     add("--figure", type=typed_path, metavar="F.png", help="draw the cosines and a PCA (extra viz)")
 
@@ -45,15 +46,16 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         ConfigError: anything the user can mend.
     """
+    distinct(out=args.out, figure=args.figure)
+
     from cmrl_jax import goal_builder, goals
 
     is_look = args.show or args.figure is not None
     if args.figure is not None:
         from cmrl_jax import plots
 
-        plots.check_figure(args.figure)
-    if not is_look or args.weights or args.force:
-        writable(args.out, "--out")  # before the sentences are encoded
+        plots.check_figure(args.figure, "goals", args.force)
+    if not is_look or args.weights:
         path = goal_builder.build(args.encoder, args.weights, args.out, args.force)
         print(f"{path}: sha256 {goal_builder.file_sha256(path)}")
     if not is_look:

@@ -16,6 +16,7 @@ import numpy as np
 from cmrl_jax.config import TASKS
 from cmrl_jax.inspection_file import Inspection, Latents
 from cmrl_jax.pca import principal_axes
+from envs.outputs import save_figure
 
 COLLAPSED = 0.1  # nats; below it on every task z is called N(0, I)
 CIRCLE = np.sqrt(-2 * np.log(0.05))  # radius that holds 95 % of a plane's standard normal
@@ -57,7 +58,7 @@ def plot_routing(pyplot: Any, panels: Panels, out: Path) -> Path:
         axis.set_title(_title(name, inspection), fontsize=10, pad=20)
     what = "mean weight with which each module of the actor is read (least to most of its readers)"
     figure.suptitle(f"{what}\n{_episodes(panels)}", fontsize=9)
-    figure.savefig(out, dpi=DPI)
+    save_figure(figure, out, "plot", dpi=DPI)
     pyplot.close(figure)
     return out
 
@@ -142,7 +143,7 @@ def plot_latents(pyplot: Any, panels: Panels, out: Path) -> Path:
         _latent_panel(axis, inspection)
         axis.set_title(_title(name, inspection), fontsize=10, fontweight="bold", pad=34)
     figure.suptitle(f"latent z of {_episodes(panels)}", fontsize=9, y=1 - 0.1 / size[1], va="top")
-    figure.savefig(out, dpi=DPI)
+    save_figure(figure, out, "plot", dpi=DPI)
     pyplot.close(figure)
     return out
 

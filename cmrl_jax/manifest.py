@@ -13,9 +13,8 @@ NAME = "sha256.txt"
 
 def write_manifest(directory: Path) -> None:
     """Lists all files below `directory`; the list appears as a whole or not at all."""
-    lines = [f"{_digest(path)}  {path.relative_to(directory)}\n" for path in _files(directory)]
     part = directory / f".{NAME}.part"
-    part.write_text("".join(lines), encoding="utf-8")
+    part.write_text(_list_of(directory), encoding="utf-8")
     part.replace(directory / NAME)
 
 
@@ -24,9 +23,11 @@ def is_listed(directory: Path) -> bool:
     return (directory / NAME).exists()
 
 
-def fingerprint(directory: Path) -> str | None:
-    """Twelve digits that tell listed content from other content, by the list alone; or no list."""
-    return _digest(directory / NAME)[:12] if is_listed(directory) else None
+def fingerprint(directory: Path) -> str:
+    """Twelve digits that tell this content from other content: of the list there is or would be."""
+    if is_listed(directory):
+        return _digest(directory / NAME)[:12]
+    return hashlib.sha256(_list_of(directory).encode()).hexdigest()[:12]
 
 
 def find_damage(directory: Path) -> str | None:
@@ -46,6 +47,12 @@ def find_damage(directory: Path) -> str | None:
             return f"{name} is not what was written"
     unlisted = there.keys() - listed.keys()
     return f"{min(unlisted)} is not in {NAME}" if unlisted else None
+
+
+def _list_of(directory: Path) -> str:
+    return "".join(
+        f"{_digest(path)}  {path.relative_to(directory)}\n" for path in _files(directory)
+    )
 
 
 def _files(directory: Path) -> list[Path]:

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cmrl_jax.config import ConfigError
+from cmrl_jax.flags import add_force
 from cmrl_jax.run_dir import find_run
 from envs.command_line import typed_path
 
 DESCRIPTION = (
     "Draws success, returns, adaptation, routing and latents of runs; seeds of one run as a band."
 )
+PICTURES = ("success.png", "returns.png", "bars.png", "k_shot.png", "routing.png", "z.png")
 
 
 def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -33,6 +35,7 @@ def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
         action="store_true",
         help="first roll out each run's policy and write DIR/inspection.json, for routing and z",
     )
+    add_force(parser)
     return parser
 
 

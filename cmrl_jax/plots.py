@@ -20,11 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config import Config, ConfigError, as_config_error
 from cmrl_jax.config_io import read_yaml, resolve
 from cmrl_jax.flags import writable
 from cmrl_jax.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.inspection_file import read_inspection
+from envs.outputs import save_figure, written_by
 
 Series = list[tuple[float, float]]
 
@@ -129,7 +130,9 @@ def _panels(pyplot: Any, runs: Runs, ylabel: str) -> tuple[Any, dict[str, Any]]:
     return figure, dict(zip(runs.tasks, axes[0], strict=True))
 
 
-def _finish(pyplot: Any, figure: Any, axes: Sequence[Any], out: Path) -> Path:
+def _finish(
+    pyplot: Any, figure: Any, axes: Sequence[Any], out: Path, command: str = "plot"
+) -> Path:
     """One legend for all panels, below them; saved and closed."""
     labelled = {}
     for axis in axes:
@@ -139,7 +142,8 @@ def _finish(pyplot: Any, figure: Any, axes: Sequence[Any], out: Path) -> Path:
     columns = max(1, int(figure.get_figwidth() / 2.8))  # inches a label may take
     place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0)}
     figure.legend(labelled.values(), labelled.keys(), ncols=columns, fontsize=8, **place)
-    figure.savefig(out, dpi=110, bbox_inches="tight")
+    with as_config_error():
+        save_figure(figure, out, command, dpi=110, bbox_inches="tight")
     pyplot.close(figure)
     return out
 
@@ -241,7 +245,8 @@ def _pictures(pyplot: Any, out: Path) -> Iterator[None]:
     """Makes the directory that pictures go to, and reports one that refuses them."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        yield
+        with as_config_error():
+            yield
     except OSError as error:
         cause = f"cannot write to {out}: {error.strerror}"
         raise ConfigError(cause, "give --out a directory you may write to") from error
@@ -295,17 +300,21 @@ def plot_inspections(runs: Sequence[Path], out: Path) -> list[Path]:
     return drawn
 
 
-def check_figure(path: Path) -> None:
+def check_figure(path: Path, command: str, force: bool) -> None:
     """Fails before hours of episodes rather than after, at `plot_adaptation`.
+
+    Args:
+        command: whose figure it is to be.
+        force: replace a file that is no such figure.
 
     Raises:
         ConfigError: matplotlib is not installed, has no such kind of picture, or the file cannot
-            be written.
+            or may not be written.
     """
     figure = _pyplot("--figure").Figure()
     if path.suffix.lower().removeprefix(".") not in figure.canvas.get_supported_filetypes():
         raise ConfigError(f"--figure {path} has no ending of a picture", "give it one, as F.png")
-    writable(path, "--figure")
+    writable(path, "--figure", written_by(command), force)
 
 
 def plot_adaptation(curves: dict[str, dict[str, dict[str, float]]], task: str, out: Path) -> Path:
@@ -321,4 +330,4 @@ def plot_adaptation(curves: dict[str, dict[str, dict[str, float]]], task: str, o
     axis.set_xlabel("episodes of own experience")
     axis.set_ylabel("success rate, any step")
     axis.set_ylim(-0.03, 1.03)
-    return _finish(pyplot, figure, [axis], out)
+    return _finish(pyplot, figure, [axis], out, "finetune")

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from cmrl_jax.config import as_config_error
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.film import Camera, Episode, Film, write_sheet, write_video
@@ -138,7 +139,7 @@ def render_run(
     films = film_run(session, policy, k, goal, goal_set, seed, horizon, caption)
     for film in films:
         video, sheet = out / f"{film.task}.mp4", out / f"{film.task}.png"
-        with Camera(film) as camera:
+        with Camera(film) as camera, as_config_error():
             write_video(film, camera, every, video)
             write_sheet(film, camera, sheet)
         sizes = ", ".join(

@@ -8,10 +8,11 @@ from typing import Any
 
 from cmrl_jax.config import ConfigError, call_envs
 from cmrl_jax.config_io import read_yaml, resolve
-from cmrl_jax.flags import episodes, goal_index, natural, seed, steps
+from cmrl_jax.flags import add_force, episodes, goal_index, natural, seed, steps, writable
 from cmrl_jax.run_dir import find_run
 from cmrl_jax.validate import check_goal_set
 from envs.command_line import make_directory, typed_path, whole
+from envs.outputs import written_by
 
 DESCRIPTION = (
     "Films one adaptation run per task in Meta-World's own scene: k exploration episodes, then the "
@@ -32,6 +33,7 @@ def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     add("--checkpoint", type=natural, metavar="N", help="iteration of the checkpoint [the last]")
     add("--every", type=whole(1), default=4, metavar="N", help="control steps a video frame [4]")
     add("--out", type=typed_path, metavar="DIR", help="where the files go [RUN/render]")
+    add_force(parser)
     return parser
 
 
@@ -55,6 +57,9 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
             raise ConfigError(cause, "pip install 'cmrl-jax[viz]'")
     out = args.out or run / "render"
     call_envs(lambda: make_directory(out, "--out"))
+    for task in config.tasks.train + config.tasks.test:
+        for ending in ("mp4", "png"):
+            writable(out / f"{task}.{ending}", "--out", written_by("render"), args.force)
     return {
         "run": run,
         "k": args.k if args.k is not None else int(has_latent),

@@ -28,12 +28,14 @@ from envs.sawyer import Ml4Env
 
 
 def prepare_jax(config: Config) -> str:
-    """Applies the `runtime` section; returns the device in words.
+    """Applies the `runtime` section, whatever was applied before; returns the device in words.
 
-    An environment that already names a compilation cache (JAX_COMPILATION_CACHE_DIR) keeps it.
+    An environment that already names a compilation cache (JAX_COMPILATION_CACHE_DIR) keeps it, and
+    its own precision (JAX_DEFAULT_MATMUL_PRECISION) is the default one.
     """
-    if config.runtime.matmul_precision == "highest":
-        jax.config.update("jax_default_matmul_precision", "highest")
+    default = os.environ.get("JAX_DEFAULT_MATMUL_PRECISION")
+    highest = config.runtime.matmul_precision == "highest"
+    jax.config.update("jax_default_matmul_precision", "highest" if highest else default)
     cache = config.runtime.compile_cache
     if cache and not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         jax.config.update("jax_compilation_cache_dir", str(Path(cache).expanduser()))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+from cmrl_jax.cells import RENAMED, UNNAMED
 from cmrl_jax.checkpoint import policy_digest
 from cmrl_jax.config import TASKS, Config
+from cmrl_jax.controls import other_task
 from cmrl_jax.evaluate_flags import DONATED, EvalOptions, evaluated_tasks
+from cmrl_jax.goals import load_goals
 from cmrl_jax.metrics import package_versions
 
 
@@ -25,19 +28,34 @@ def donors_of(options: EvalOptions, config: Config) -> str | None:
     return f"{'+'.join(tasks)} x {options.goals} goals x {options.draws} draws"
 
 
+def sentences_of(options: EvalOptions, config: Config) -> str | None:
+    """What decides which vectors sentences have: the encoder of `text`, or a table by its digest.
+
+    None where no sentence comes from either: they are those in the checkpoint, or zero.
+    """
+    if options.text is not None:
+        return config.goals.table  # `embed` refuses another encoder's weights
+    tasks = evaluated_tasks(options, config)
+    if options.text_control == "shuffled":
+        tasks = tuple(other_task(task) for task in tasks)
+    known = set(tasks) <= set(config.tasks.train + config.tasks.test)
+    if options.text_control == "zero" or (known and options.paraphrases == "train"):
+        return None
+    return load_goals(config.goals.table, tasks).sha256[:12]
+
+
 def settings(options: EvalOptions, config: Config) -> dict[str, Any]:
-    """The columns `scores.SETTINGS`: what a figure was taken with, the checkpoint apart."""
-    return {
+    """The columns `cells.SETTINGS`: what a figure was taken with, the checkpoint apart."""
+    given = {
+        RENAMED.get(f.name, f.name): getattr(options, f.name)
+        for f in fields(options)
+        if f.name not in UNNAMED
+    }
+    return given | {
         "physics": options.physics or config.env.physics,
         "horizon": horizon_of(options, config),
-        "goal_set": options.goal_set,
-        "policy": options.policy,
-        "z": options.z,
         "donors": donors_of(options, config),
-        "paraphrases": options.paraphrases,
-        "text_control": options.text_control,
-        "text": options.text,
-        "eval_seed": options.seed,
+        "sentences": sentences_of(options, config),
     }
 
 

@@ -8,7 +8,6 @@ not run again: a sweep that was stopped goes on when its command is repeated.
 from __future__ import annotations
 
 import itertools
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,11 +17,12 @@ from typing import Any, Literal
 import jax
 
 from cmrl_jax.bench_sweep import time_commands, time_one_by_one
-from cmrl_jax.config import TASKS
+from cmrl_jax.cells import CellTable
+from cmrl_jax.config import TASKS, call_envs
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.evaluate_flags import DONATED, EvalOptions
 from cmrl_jax.metrics import format_duration
-from cmrl_jax.scores import ScoreCsv, cell_rows, fault_warning, of_policy, summarise_rows
+from cmrl_jax.scores import cell_rows, fault_warning, of_policy, summarise_rows
 from cmrl_jax.session import Policy, Session, prepare_jax
 from cmrl_jax.settings import result_fields, row_columns
 from cmrl_jax.targets import (
@@ -35,6 +35,7 @@ from cmrl_jax.targets import (
     targets_of,
 )
 from cmrl_jax.trials import Plan, fitted, lane_budget, memory_limit, plan_batches, trial_of
+from envs.outputs import write_json
 
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell has it
 
@@ -66,18 +67,21 @@ def sweep(
     json_path: Path | None,
     csv_path: Path | None,
     compare: int,
+    force: bool,
 ) -> int:
     """Scores the checkpoints, prints a table, writes JSON and CSV; returns the exit code.
 
     Args:
         compare: adaptation runs that are timed one at a time, too; 0 for none.
+        force: begin a CSV anew that is no table of cells.
 
     Raises:
-        ConfigError: a run without such a checkpoint, or one that does not fit this program.
+        ConfigError: a run without such a checkpoint, or one that does not fit this program; a CSV
+            that cannot be gone on with.
     """
     targets = [t for run in runs for t in targets_of(run, checkpoints, options)]
-    print(f"device: {prepare_jax(targets[0].config)}", flush=True)
-    with ScoreCsv(csv_path, resume=True) as table:
+    with CellTable(csv_path, force) as table:
+        print(f"device: {prepare_jax(targets[0].config)}", flush=True)
         todo = {target: pending_tasks(target, options, table) for target in targets}
         cells = [len(tasks) * cells_per_task(target, options) for target, tasks in todo.items()]
         progress = Progress(total=sum(cells))
@@ -107,7 +111,7 @@ def sweep(
             "compile_seconds": progress.compile_seconds,
             "one_by_one": comparison,
         }
-        json_path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        call_envs(lambda: write_json(json_path, "sweep", result))
     return 0
 
 
@@ -117,12 +121,13 @@ def is_interrupt(error: BaseException) -> bool:
 
 
 def evaluate_group(
-    todo: dict[Target, tuple[str, ...]], options: EvalOptions, table: ScoreCsv, progress: Progress
+    todo: dict[Target, tuple[str, ...]], options: EvalOptions, table: CellTable, progress: Progress
 ) -> None:
     """Runs the pending tasks of targets that share a program, and writes their cells."""
     if not todo:
         return
     targets = sorted(todo, key=lambda t: [TASKS.index(task) for task in todo[t]])
+    prepare_jax(targets[0].config)  # each program has the precision of its own runs
     session = Session(targets[0].config)
     most = max(len(tasks) for tasks in todo.values())
     plan = plan_batches(len(targets), most, options.goals * options.draws, lane_budget(options))
@@ -173,7 +178,7 @@ def run_batch(
     policies: list[Policy],
     tasks: tuple[str, ...],
     options: EvalOptions,
-    table: ScoreCsv,
+    table: CellTable,
     progress: Progress,
 ) -> None:
     """Scores a batch of checkpoints on some tasks and writes the rows."""
@@ -193,7 +198,7 @@ def run_batch(
 def compared(
     members: Sequence[Target],
     options: EvalOptions,
-    table: ScoreCsv,
+    table: CellTable,
     count: int,
     progress: Progress,
 ) -> dict[str, Any]:
@@ -221,7 +226,7 @@ def compared(
     return found
 
 
-def evaluation_of(target: Target, options: EvalOptions, table: ScoreCsv) -> dict[str, Any]:
+def evaluation_of(target: Target, options: EvalOptions, table: CellTable) -> dict[str, Any]:
     """What `eval` would write of the target, from the table's rows."""
     rows = [
         row

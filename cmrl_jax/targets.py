@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from cmrl_jax.cells import CellTable
 from cmrl_jax.checkpoint import policy_store
-from cmrl_jax.config import TASKS, Config, ConfigError
+from cmrl_jax.config import TASKS, Config, ConfigError, leaves
 from cmrl_jax.evaluate_flags import DONATED, EvalOptions, evaluated_tasks
-from cmrl_jax.scores import ScoreCsv
 from cmrl_jax.session import Policy, Session, load_policy
 from cmrl_jax.settings import cell_columns, settings
 from cmrl_jax.trials import evaluation_config
@@ -55,19 +55,68 @@ def targets_of(
 
 
 def program_key(target: Target) -> str:
-    """Targets of one key are scored by one compiled program, and adapt equally often."""
+    """Targets of one key are scored by one compiled program, and adapt equally often.
+
+    The key is the whole configuration less what is known not to act, so that a key of the schema
+    which nobody thought of here costs a compile, and never scores a policy as another's.
+    """
     config = target.config
+    acting = [(name, value) for name, _, value in leaves(config) if not _is_idle(name)]
     told = config.tasks.train if config.model.conditioning == "task_id" else ()
-    env = (config.env.physics, config.env.impl, config.env.horizon, config.env.goal_observable)
-    parts = (env, config.env.obs_mode, config.model, config.encoder, config.goals, told)
-    return repr((*parts, config.sac.normalize_obs, config.collect.chunk, target.k))
+    return repr((acting, told, target.k))
+
+
+IDLE = (
+    "name",
+    "seed",
+    "tasks.",  # told to a policy by `program_key`, where it is told them at all
+    "env.variation",  # an evaluation names its placements
+    "kl.",
+    "collect.lanes",
+    "collect.updates_per_vector_step",
+    "collect.group_frac",
+    "collect.noise_correlation",
+    "collect.noise_scale",
+    "collect.initial",
+    "collect.context_source",
+    "collect.context_episodes",
+    "collect.context_lanes",
+    "collect.own_context",
+    "sac.variant",
+    "sac.alpha",
+    "sac.alpha_init",
+    "sac.target_entropy",
+    "sac.gamma",
+    "sac.tau",
+    "sac.n_step",
+    "sac.reward_scale",
+    "sac.reward_norm",
+    "sac.return_max",
+    "sac.task_reduce",
+    "sac.loss_balance",
+    "sac.policy_reg",
+    "sac.batch",
+    "sac.task_rows",
+    "sac.lr",
+    "sac.grad_clip",
+    "train.",
+    "eval.",  # an evaluation has options of its own; k is part of the key
+    "checkpoint.",
+    "log.",
+    "runtime.compile_cache",
+)
+"""Keys, and with a dot whole sections, that training reads and a policy that acts does not."""
+
+
+def _is_idle(name: str) -> bool:
+    return name in IDLE or any(name.startswith(x) for x in IDLE if x.endswith("."))
 
 
 def cells_per_task(target: Target, options: EvalOptions) -> int:
     return options.goals * options.draws * len(target.k)
 
 
-def pending_tasks(target: Target, options: EvalOptions, table: ScoreCsv) -> tuple[str, ...]:
+def pending_tasks(target: Target, options: EvalOptions, table: CellTable) -> tuple[str, ...]:
     """The tasks of a target with a cell that is not in the table.
 
     Where a lane's z is another lane's, an evaluation is whole or it is another evaluation.

@@ -60,10 +60,12 @@ class Plan:
 def plan_batches(policies: int, tasks: int, per_task: int, budget: int) -> Plan:
     """Policies side by side first, then as many whole tasks of them as `budget` lanes hold.
 
+    Batches are equally full: 6 policies where 5 have room are 3 and 3, not 5 and 1 beside 4 copies.
+
     Args:
         per_task: lanes of one policy on one task.
     """
-    side = max(1, min(policies, budget // per_task))
+    side = _even(policies, max(1, budget // per_task))
     lanes = min(tasks * per_task, max(1, budget // side))
     return Plan(side, lanes - lanes % per_task if lanes > per_task else lanes)
 
@@ -78,8 +80,14 @@ def fitted(plan: Plan, needed: int, limit: int | None) -> Plan:
     if limit is None or needed <= limit:
         return plan
     if plan.policies > 1:
-        return Plan(max(1, math.floor(plan.policies * limit / needed)), plan.lanes)
+        side = max(1, math.floor(plan.policies * limit / needed))
+        return Plan(_even(plan.policies, side), plan.lanes)
     return Plan(1, max(1, math.floor(plan.lanes * limit / needed)))
+
+
+def _even(count: int, most: int) -> int:
+    """The size of as few batches as hold `count`, at most `most` each, where none is fuller."""
+    return math.ceil(count / math.ceil(count / most))
 
 
 def memory_limit() -> int | None:

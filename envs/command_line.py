@@ -96,24 +96,6 @@ def what_is(path: str | Path) -> Literal["file", "directory", "nothing"]:
     return "directory" if stat.S_ISDIR(mode) else "file"
 
 
-def check_writable(path: Path, flag: str) -> None:
-    """Makes the folders above a file that is to be written later, and leaves the file as it was.
-
-    Raises:
-        ValueError: it cannot be written; better now than after an hour of figures.
-    """
-    try:
-        is_new = what_is(path) == "nothing"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # Without O_NONBLOCK a pipe that nobody reads would wait for a reader for ever.
-        os.close(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK, 0o666))
-        if is_new:
-            os.unlink(os.path.realpath(path))  # what a dangling link points to, not the link
-    except OSError as error:
-        cause = f"cannot write {brief(path)}: {error.strerror}"
-        raise ValueError(f"{cause}\ngive {flag} a file you may write to") from error
-
-
 def make_directory(path: Path, flag: str) -> None:
     """Makes a directory that is to be written to.
 

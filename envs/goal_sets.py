@@ -17,7 +17,6 @@ from __future__ import annotations
 import difflib
 import os
 import pickle
-import tempfile
 import zipfile
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -26,8 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from envs.command_line import Parser, check_writable, run, typed_path
+from envs.command_line import Parser, run, typed_path
 from envs.goal_names import GOALS, SEEDS, seed_of
+from envs.outputs import FORCE_HELP, check_output, replacing
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 
@@ -120,7 +120,7 @@ def _fresh(task: str, seed: int, cache: Path | None) -> np.ndarray:
         goals = draw_goals(task, seed)
         try:
             _write(path, {"goals": goals})
-        except OSError:
+        except (OSError, ValueError):
             # The cache saves a second at the next start; a read-only home must not stop a run.
             return goals
     return _goals(_read(path, f"delete {path} and start again"), "goals", path)
@@ -157,15 +157,12 @@ def _goals(arrays: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Writes an npz whose bytes depend on the arrays alone, and only ever whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
-        with zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
-            for key in sorted(arrays):
-                # np.savez stamps the time of day on each member; a fixed date keeps the file equal.
-                entry = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-                with archive.open(entry, "w") as member:
-                    np.lib.format.write_array(member, np.ascontiguousarray(arrays[key]))
-    os.chmod(part.name, 0o644)
-    os.replace(part.name, path)
+    with replacing(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
+        for key in sorted(arrays):
+            # np.savez stamps the time of day on each member; a fixed date keeps the file equal.
+            entry = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+            with archive.open(entry, "w") as member:
+                np.lib.format.write_array(member, np.ascontiguousarray(arrays[key]))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -180,10 +177,12 @@ def _write_and_show(argv: Sequence[str] | None) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("--out", type=typed_path, default=_PACKAGED, metavar="F", help="[packaged]")
-    out = parser.parse_args(argv).out
-    check_writable(out, "--out")
-    write_packaged(out)
-    for key, goals in _read(out, "run the command again").items():
+    parser.add_argument("--force", action="store_true", help=FORCE_HELP)
+    args = parser.parse_args(argv)
+    # Its bytes depend on the goals alone, so it is known by the names of its sets.
+    check_output(args.out, "--out", f"heldout/{TASKS[0]}.npy", args.force)
+    write_packaged(args.out)
+    for key, goals in _read(args.out, "run the command again").items():
         print(f"{key:22s} {len(goals)} goals from {goals.min(0)} to {goals.max(0)} m")
 
 

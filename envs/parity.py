@@ -14,9 +14,10 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from envs.command_line import Parser, check_writable, run, typed_path, whole
+from envs.command_line import Parser, run, typed_path, whole
 from envs.goal_names import GOALS, LARGEST_SEED, name_of
 from envs.goal_sets import load_goal_set
+from envs.outputs import FORCE_HELP, check_output, write_json, written_by
 
 DEFAULT_NOISE = 0.3  # of the second closed-loop run when all parts are measured
 STATE_GOALS = 10  # parts 1 to 3 take their states from at most so many goals a task
@@ -52,6 +53,7 @@ def _parser() -> argparse.ArgumentParser:
         "--horizon", type=steps, default=200, metavar="H", help="control steps an episode [200]"
     )
     parser.add_argument("--json", type=typed_path, metavar="F", help="write the figures there, too")
+    parser.add_argument("--force", action="store_true", help=FORCE_HELP)
     return parser
 
 
@@ -62,7 +64,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.noise is not None and not 0 <= args.noise < float("inf"):
         raise ValueError(f"--noise {args.noise} is no standard deviation\nuse 0 or more, as 0.3")
     if args.json:
-        check_writable(args.json, "--json")
+        check_output(args.json, "--json", written_by("envs.parity"), args.force)
 
 
 def measure(
@@ -142,12 +144,12 @@ def _measure_and_report(words: Sequence[str] | None) -> None:
     seed, all_parts = args.seed or 0, not args.policies
     result = measure(args.physics, goal_set, args.goals, args.horizon, noises, seed, all_parts)
     result["seconds"] = round(time.perf_counter() - start, 1)
-    from envs.parity_report import report, to_json
+    from envs.parity_report import finite, report
 
     print(report(result))
     print(f"\nmeasured in {result['seconds']:.0f} s, compiling included")
     if args.json:
-        args.json.write_text(to_json(result))
+        write_json(args.json, "envs.parity", finite(result))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

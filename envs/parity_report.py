@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -110,14 +109,10 @@ def _resets(tasks: dict[str, Any]) -> list[str]:
     return [table("5. Start observations", ("task", "obs max"), rows)] if rows else []
 
 
-def to_json(result: dict[str, Any]) -> str:
-    """Strict JSON: what could not be measured (NaN) is null."""
-    return json.dumps(_finite(result), indent=2, allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """A result for strict JSON: what could not be measured (NaN) is null."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.command_line import Parser, make_directory, run, typed_path
+from envs.outputs import FORCE_HELP, check_output, replacing, written_by
 from envs.render import choose_gl
 
 SCENES = ("drawer", "window")
@@ -55,7 +56,9 @@ def write_picture(scene: str, out: Path) -> None:
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]
     pyplot.close(figure)
     # Five bits a channel: half the file, and still the colours of the legend.
-    pyplot.imsave(out, pixels // 8 * 8 + pixels // 32)
+    with replacing(out) as part:
+        text = {"Software": written_by("envs.picture")}
+        pyplot.imsave(part, pixels // 8 * 8 + pixels // 32, metadata=text)
 
 
 def draw_task(task: str) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
@@ -108,9 +111,13 @@ def _write_pictures(argv: Sequence[str] | None) -> None:
     parser.add_argument(
         "--out", type=typed_path, default=default, metavar="DIR", help=f"[{default}]"
     )
-    out = parser.parse_args(argv).out
-    choose_gl()
+    parser.add_argument("--force", action="store_true", help=FORCE_HELP)
+    args = parser.parse_args(argv)
+    out = args.out
     make_directory(out, "--out")
+    for scene in SCENES:
+        check_output(out / f"{scene}.png", "--out", written_by("envs.picture"), args.force)
+    choose_gl()
     for scene in SCENES:
         write_picture(scene, out / f"{scene}.png")
         print(out / f"{scene}.png")

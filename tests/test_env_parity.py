@@ -7,7 +7,7 @@ import pytest
 from env_fixtures import GOALS_A_TASK, LANES
 
 from envs import parity, parity_parts
-from envs.parity_report import table, to_json
+from envs.parity_report import finite, table
 from envs.tasks import TASKS
 
 RUN = ("--goals", str(GOALS_A_TASK), "--horizon", "12")
@@ -95,7 +95,7 @@ def test_tables_align_and_json_has_no_nan():
     text = table("title", ("task", "any"), [["drawer-open", 1.0], ["x", float("nan")]])
     lines = ["title", "  task           any", "  drawer-open  1.000", "  x                -"]
     assert text.splitlines() == lines
-    assert json.loads(to_json({"a": {"b": float("nan"), "c": 1.5}})) == {"a": {"b": None, "c": 1.5}}
+    assert finite({"a": {"b": float("nan"), "c": 1.5}}) == {"a": {"b": None, "c": 1.5}}
 
 
 @pytest.mark.parametrize(

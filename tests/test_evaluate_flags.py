@@ -10,6 +10,7 @@ import cmrl_jax
 from cmrl_jax.cli import main
 from cmrl_jax.config_io import load_config, to_yaml
 from cmrl_jax.evaluate_flags import EvalOptions
+from envs.outputs import write_json
 
 
 @pytest.fixture
@@ -62,11 +63,6 @@ def make_run(path: Path, config: str = "ml4.yaml") -> None:
             "--z other with --physics metaworld",
             "--z posterior",
         ),
-        (
-            ["eval", "--run", "x", "--lanes", "64", "--physics", "metaworld"],
-            "--lanes with --physics metaworld",
-            "--physics native",
-        ),
         (["eval", "--run", "x", "--text", ""], "--text is empty", "--text-control zero"),
         (["sweep", "--runs", "x", "--text", " \t"], "--text is empty", "write a sentence"),
         (["sweep"], "required: --runs", "--help"),
@@ -106,11 +102,11 @@ def test_eval_hands_over_its_flags(calls, here):
     assert main(["eval", "--run", "r", *text]) == 0
     assert calls[0] == {
         "run": Path("r"), "options": OPTIONS, "checkpoint": 12,
-        "json_path": Path("out/f.json"), "csv_path": Path("out/f.csv"),
+        "json_path": Path("out/f.json"), "csv_path": Path("out/f.csv"), "force": False,
     }  # fmt: skip
     assert calls[1] == {
         "run": Path("r"), "options": EvalOptions(), "checkpoint": None,
-        "json_path": None, "csv_path": None,
+        "json_path": None, "csv_path": None, "force": False,
     }  # fmt: skip
     assert calls[2]["options"] == EvalOptions(text="shut it", weights=Path("w"))
     assert list((here / "out").iterdir()) == []  # tried, and left to the command to write
@@ -127,13 +123,32 @@ def test_sweep_hands_over_its_flags(calls, refused, here):
     assert calls[0] == {
         "runs": [Path("runs/b"), Path("runs/a-1"), Path("runs/a-2")], "checkpoints": (20, 40),
         "options": OPTIONS, "json_path": Path("f.json"), "csv_path": Path("f.csv"), "compare": 0,
+        "force": False,
     }  # fmt: skip
     assert calls[1] == {
         "runs": [Path("runs/b")], "checkpoints": "last", "options": EvalOptions(),
-        "json_path": None, "csv_path": None, "compare": 8,
+        "json_path": None, "csv_path": None, "compare": 8, "force": False,
     }  # fmt: skip
     make_run(here / "runs" / "m", "mtsac.yaml")
     assert "(runs/m)" in refused("sweep", "--runs", "runs/*", "--k", "0,1")[0]
+
+
+@pytest.mark.parametrize("command", [["eval", "--run", "r"], ["sweep", "--runs", "r"]])
+def test_outputs_of_others_stay(calls, refused, here, command):
+    make_run(here / "r")
+    other = {"eval": "sweep", "sweep": "eval"}[command[0]]
+    own, foreign = here / "own.json", here / "foreign.json"
+    write_json(own, command[0], {})
+    write_json(foreign, other, {})
+    (here / "metrics.csv").write_text("iteration,env_steps\n0,1\n")
+    for words in (["--json", "foreign.json"], ["--csv", "metrics.csv"], ["--csv", "own.json"]):
+        cause, cure = refused(*command, *words)
+        assert f"{words[1]} is there" in cause and "--force" in cure
+        assert main([*command, *words, "--force"]) == 0
+    assert calls[-1]["force"] is True
+    assert main([*command, "--json", "own.json"]) == 0
+    cause, cure = refused(*command, "--json", "f", "--csv", "./f")
+    assert "--json and --csv are one file" in cause and "of its own" in cure
 
 
 def test_eval_without_a_latent_does_not_adapt(calls, refused, here):

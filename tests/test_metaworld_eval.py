@@ -12,12 +12,14 @@ import pytest
 from metaworld.evaluation import metalearning_evaluation
 from policy_fixtures import HORIZON, random_policy, save_run, small_config
 
+from cmrl_jax import evaluate_metaworld
 from cmrl_jax.cli import main
 from cmrl_jax.evaluate import Evaluator, lane_names
 from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.evaluate_metaworld import (
     adaptation_run,
     agent_of,
+    format_own,
     k_shot,
     metaworlds_own,
     of_task,
@@ -212,8 +214,12 @@ def test_more_goals_than_environments(session, policy, monkeypatch):
     """Batches of two, the last one padded: as with one environment for each goal."""
     trial = of_task(session.trial("heldout", 3), 0)
     wanted = k_shot(session, policy, trial, (0, 1), HORIZON, seed=3)
-    monkeypatch.setattr("cmrl_jax.evaluate_metaworld.ENVIRONMENTS", 2)
-    found = k_shot(session, policy, trial, (0, 1), HORIZON, seed=3)
+    made = []
+    make = evaluate_metaworld.make_vector_env
+    record = lambda *args: made.append(args[2]) or make(*args)
+    monkeypatch.setattr(evaluate_metaworld, "make_vector_env", record)
+    found = k_shot(session, policy, trial, (0, 1), HORIZON, seed=3, environments=2)
+    assert made == [2]
     for k in (0, 1):
         assert found[k].returns.shape == (1, 3, 1)
         np.testing.assert_allclose(found[k].returns, wanted[k].returns, rtol=1e-4)
@@ -304,6 +310,29 @@ def test_the_first_evaluation_episode_is_the_protocols_k(session, policy, trial)
         assert own["num_evals"] == 1 and own["adaptation_episodes"] == k
 
 
+def test_metaworlds_own_function_plays_every_draw_of_every_goal(session, policy, monkeypatch):
+    one = replace(of_task(session.trial("heldout", 2), 1), draws=3)
+    visited, agents = [], []
+
+    def evaluation(agent, envs, num_evals, **episodes):
+        for _ in range(num_evals):
+            agent.init()
+            envs.call("sample_tasks")
+            visited.append(envs.envs[0].unwrapped._last_rand_vec.copy())
+            agents.append(agent._lane_id.item())
+        return 0.5, 1.0, {}
+
+    monkeypatch.setattr(evaluate_metaworld, "metalearning_evaluation", evaluation)
+    options = EvalOptions(goals=2, draws=3, seed=3, physics="metaworld")
+    own = metaworlds_own(session, policy, one, options, HORIZON)
+    assert (own["num_evals"], own["draws"]) == (6, 3)
+    places, counts = np.unique(np.round(visited, 6), axis=0, return_counts=True)
+    wanted = np.unique(np.round(one.placements[0], 6), axis=0)
+    np.testing.assert_allclose(places, wanted, atol=1e-6)
+    assert list(counts) == [3, 3] and len(set(agents)) == 6
+    assert "2 goals, 3 runs each" in format_own({"drawer-close": own})
+
+
 def test_goals_are_those_of_the_set(trial):
     for row, task in enumerate(trial.tasks):
         envs = make_vector_env(task, trial.placements[row], 1, HORIZON)
@@ -326,7 +355,8 @@ def test_the_command_writes_both_figures(session, tmp_path, capsys, refused):
     files = ["--json", str(tmp_path / "f.json"), "--csv", str(tmp_path / "f.csv")]
     own = ["--adaptation-episodes", "1", "--evaluation-episodes", "2"]
     tasks = ["--tasks", "window-close,drawer-open"]
-    assert main([*words, *tasks, *own, *files]) == 0
+    lanes = ["--lanes", "1"]
+    assert main([*words, *tasks, *own, *files, *lanes]) == 0
     result = json.loads((tmp_path / "f.json").read_text())
     assert list(result["tasks"]) == ["window-close", "drawer-open"]
     assert (result["physics"], result["horizon"], result["goals"]) == ("metaworld", HORIZON, 2)

@@ -6,13 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from cmrl_jax.config import ConfigError
+from cmrl_jax.cells import COLUMNS, FIGURES, CellTable
 from cmrl_jax.episode import Episode
 from cmrl_jax.scores import (
-    CELL,
-    COLUMNS,
-    FIGURES,
-    ScoreCsv,
     bootstrap_interval,
     cell_rows,
     format_scores,
@@ -27,7 +23,7 @@ COMMON = {
     "config": "cmrl", "train_seed": 0, "env_steps": 9,
     "physics": "mjx", "horizon": 200, "goal_set": "heldout", "policy": "deterministic",
     "z": "posterior", "donors": None, "paraphrases": "train", "text_control": "none", "text": None,
-    "eval_seed": 0,
+    "sentences": None, "eval_seed": 0,
 }  # fmt: skip
 
 
@@ -110,7 +106,7 @@ def test_faults_of_the_physics_are_told():
 
 def test_rows_hold_every_figure(tmp_path):
     path = tmp_path / "s.csv"
-    with ScoreCsv(path, resume=False) as table:
+    with CellTable(path) as table:
         table.add(cell_rows(of_policy(SCORES, 1), TASKS, COMMON))
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -123,44 +119,3 @@ def test_rows_hold_every_figure(tmp_path):
         assert (row["run"], row["checkpoint"], row["text"]) == ("runs/a", "20", "")
     wanted = summarise(of_policy(SCORES, 1), TASKS)
     assert_summaries_agree(summarise_rows(rows), wanted)
-
-
-def cell(row):
-    return {name: row[name] for name in (*CELL, *COMMON) if name in row}
-
-
-def test_a_file_is_gone_on_with(tmp_path):
-    path = tmp_path / "s.csv"
-    rows = cell_rows(of_policy(SCORES, 0), TASKS, COMMON)
-    with ScoreCsv(path, resume=True) as table:  # nothing there yet
-        table.add(rows[:7])
-    whole = path.read_bytes()
-    path.write_bytes(whole + b"runs/a,20,window-open,4")  # killed while it wrote
-    with ScoreCsv(path, resume=True) as table:
-        assert [table.holds(cell(row)) for row in rows[:9]] == [True] * 7 + [False] * 2
-        assert not table.holds(cell(rows[0]) | {"horizon": 500})  # another setting, another cell
-        assert not table.holds(cell(rows[0]) | {"run": "runs/b"})
-        table.add(rows)
-    assert path.read_bytes().startswith(whole)
-    with ScoreCsv(path, resume=True) as table:
-        assert table.rows({}) == rows
-    assert path.read_text().count("\n") == 1 + len(rows)  # each once
-    with ScoreCsv(path, resume=False) as table:
-        assert table.rows({}) == [] and path.read_text().count("\n") == 1
-
-
-def test_rows_of_one_checkpoint(tmp_path):
-    table = ScoreCsv(None, resume=True)
-    for checkpoint in (20, 40):
-        common = COMMON | {"checkpoint": checkpoint}
-        table.add(cell_rows(of_policy(SCORES, 0), TASKS, common))
-    assert len(table.rows({"checkpoint": 40, "text": None})) == 60
-    assert {r["checkpoint"] for r in table.rows({"checkpoint": 40})} == {"40"}
-
-
-def test_a_foreign_file_is_not_overwritten(tmp_path):
-    path = tmp_path / "s.csv"
-    path.write_text("iteration,env_steps\n0,1\n")
-    with pytest.raises(ConfigError, match="does not hold the columns"):
-        ScoreCsv(path, resume=True)
-    assert path.read_text() == "iteration,env_steps\n0,1\n"

@@ -33,8 +33,10 @@ LIGHT = {
     "goal_files",
     "goals_cli",
     "cli",
+    "cells",
+    "locks",
 }
-LIGHT_OF_ENVS = {"command_line", "goal_names"}  # what those take from envs
+LIGHT_OF_ENVS = {"command_line", "goal_names", "outputs"}  # what those take from envs
 COMMANDS = {
     "cli",
     "evaluate_flags",
@@ -77,7 +79,7 @@ ROWS = (
         "inspection_file",
     },
     {"goal_files", "pca", "old_statistics"},
-    {"manifest", "named_arrays", "parallel", "moments"},
+    {"manifest", "named_arrays", "parallel", "moments", "locks"},
     {"validate"},
     {"config", "commands"},
 )

@@ -5,20 +5,21 @@ import json
 import shutil
 from dataclasses import replace
 
+import jax
 import pytest
 from policy_fixtures import save_run, small_config
 
 from cmrl_jax import bench_sweep
 from cmrl_jax import sweep as sweep_module
 from cmrl_jax.bench_sweep import command_words
+from cmrl_jax.cells import CellTable
 from cmrl_jax.cli import main
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import EvalOptions, eval_parser, options_of, sweep_parser
+from cmrl_jax.evaluate_flags import eval_parser, options_of, sweep_parser
 from cmrl_jax.flags import parse
 from cmrl_jax.session import Session
 from cmrl_jax.sweep import INTERRUPTED
-from cmrl_jax.targets import columns_of, targets_of
-from cmrl_jax.trials import Plan, fitted, plan_batches
+from cmrl_jax.targets import targets_of
 from envs.native import NativePhysics
 
 GOALS, KS, TASKS = 3, ("0", "2"), 4
@@ -94,7 +95,7 @@ def test_figures_are_those_of_eval(runs, swept, tmp_path):
         assert main(["eval", "--run", found["run"], *PROTOCOL, *words]) == 0
         alone = json.loads((tmp_path / "e.json").read_text())
         assert {k: v for k, v in found.items() if k != "tasks"} == {
-            k: v for k, v in alone.items() if k != "tasks"
+            k: v for k, v in alone.items() if k not in ("tasks", "origin")
         }
         assert set(found["tasks"]) == set(alone["tasks"])
         for task, by_k in alone["tasks"].items():
@@ -131,6 +132,29 @@ def test_a_stopped_sweep_goes_on_and_runs_no_cell_twice(runs, swept, tmp_path, m
     calls.clear()
     assert sweep(runs, path, *small) == 0
     assert calls == [] and read(path) == found
+
+
+def test_eval_adds_to_a_sweeps_table(runs, swept, tmp_path, capsys):
+    """Its own rows, each once; the sweep's stay as they are."""
+    path = shutil.copy(runs / "s.csv", tmp_path / "s.csv")
+    before = path.read_bytes()
+    words = ["eval", "--run", str(runs / "b"), *PROTOCOL, "--csv", str(path)]
+    assert main(words) == 0
+    assert path.read_bytes() == before and "0 rows added, 24 were there" in capsys.readouterr().out
+    assert main([*words, "--seed", "7"]) == 0
+    assert "24 rows added, 0 were there" in capsys.readouterr().out
+    assert path.read_bytes().startswith(before)
+    with path.open(newline="") as file:
+        seeds = [row["eval_seed"] for row in csv.DictReader(file)]
+    assert seeds == ["0"] * len(swept[0]) + ["7"] * TASKS * GOALS * len(KS)
+
+
+def test_a_table_that_another_process_writes_to_is_refused_before_any_work(runs, tmp_path, refused):
+    path = tmp_path / "s.csv"
+    with CellTable(path):
+        for words in (["sweep", "--runs"], ["eval", "--run"]):
+            cause, cure = refused(*words, str(runs / "b"), "--csv", str(path))
+            assert f"another process is writing to {path}" in cause and "--csv" in cure
 
 
 def test_other_settings_are_other_cells(runs, tmp_path):
@@ -197,39 +221,26 @@ def test_missing_checkpoints_are_named(runs, refused, tmp_path):
     assert "no policy checkpoint" in refused("sweep", "--runs", str(run))[0]
 
 
-def test_plans():
-    assert plan_batches(4, tasks=4, per_task=50, budget=8192) == Plan(4, 200)
-    assert plan_batches(4, tasks=4, per_task=50, budget=256) == Plan(4, 50)
-    assert plan_batches(20, tasks=4, per_task=50, budget=256) == Plan(5, 50)
-    assert plan_batches(1, tasks=4, per_task=50, budget=256) == Plan(1, 200)
-    assert plan_batches(4, tasks=1, per_task=250, budget=100) == Plan(1, 100)
-    for policies, lanes, needed in ((4, 50, 1100), (1, 50, 3000), (9, 7, 10**6)):
-        plan = Plan(policies, lanes)
-        assert fitted(plan, needed, None) == fitted(plan, 1000, 1000) == plan
-        smaller = fitted(plan, needed, 1000)
-        size = smaller.policies * smaller.lanes
-        assert 1 <= size < policies * lanes
-        assert size <= policies * lanes * 1000 / needed or smaller.policies == 1
-    assert fitted(Plan(1, 2), 10**9, 1) == Plan(1, 1)
+def test_a_sweep_has_the_precision_of_each_run(runs, tmp_path, monkeypatch):
+    """Two runs that differ in it alone are two programs, each compiled with its own."""
+    config = small_config(**{"runtime.matmul_precision": "default"})
+    save_run(tmp_path / "default", Session(config), seeds=(1,))
+    shutil.copytree(runs / "a", tmp_path / "highest")
+    found, compile_ = [], Evaluator.compile
 
+    def recorded(self, params, width):
+        if not self.is_compiled:
+            found.append(jax.config.jax_default_matmul_precision)
+        compile_(self, params, width)
 
-def test_another_policy_in_its_place_is_another_cell(runs, tmp_path):
-    run = shutil.copytree(runs / "b", tmp_path / "b")
-    named = lambda: columns_of(targets_of(run, "all", EvalOptions())[0], EvalOptions())
-    before, listed = named(), run / "policy" / "1" / "sha256.txt"
-    listed.write_text(listed.read_text().replace("a", "b"))  # as of other weights
-    changed = {name for name, value in named().items() if value != before[name]}
-    assert changed == {"policy_sha256"} and before["policy_sha256"]
-
-
-def test_cells_with_anothers_z_are_of_one_set_of_lanes(runs):
-    [target] = targets_of(runs / "b", "all", EvalOptions())
-    base = EvalOptions(goals=50)
-    options = [(base, False), (replace(base, z="shuffled"), True), (replace(base, z="other"), True)]
-    for many, differs in options:
-        few = replace(many, goals=10, tasks=("window-open",))
-        a, b = columns_of(target, few), columns_of(target, many)
-        assert (a != b) == differs
+    monkeypatch.setattr(Evaluator, "compile", recorded)
+    words = ["--runs", str(tmp_path / "default"), str(tmp_path / "highest")]
+    before = jax.config.jax_default_matmul_precision
+    try:
+        assert main(["sweep", *words, *PROTOCOL]) == 0
+    finally:
+        jax.config.update("jax_default_matmul_precision", before)
+    assert sorted(map(str, found)) == ["None", "highest"]
 
 
 def test_ctrl_c_while_mujoco_steps_stops_the_sweep(runs, tmp_path, monkeypatch, capsys):
