@@ -24,6 +24,7 @@ LIGHT = {
     "validate",
     "config_io",
     "run_dir",
+    "documents",
     "stop",
     "flags",
     "evaluate_flags",
@@ -77,7 +78,7 @@ ROWS = (
         "inspection_file",
     },
     {"goal_files", "pca"},
-    {"manifest", "named_arrays", "parallel"},
+    {"manifest", "named_arrays", "parallel", "documents"},
     {"validate"},
     {"config", "commands"},
 )
