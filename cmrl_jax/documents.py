@@ -9,17 +9,21 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-from cmrl_jax.config import ConfigError
+from cmrl_jax.config import ConfigError, call_envs
+from envs.command_line import what_is
 
 
 def is_there(path: Path) -> bool:
-    """Whether there is such a file; a name that no file can have is none."""
-    return os.path.isfile(path)  # pathlib's raises for a name that is too long
+    """Whether there is such a file.
+
+    Raises:
+        ConfigError: the system cannot follow its path.
+    """
+    return call_envs(lambda: what_is(path)) == "file"
 
 
 def read_text(path: Path, cure: str) -> str:

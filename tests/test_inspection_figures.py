@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cmrl_jax import inspection_figures
 from cmrl_jax.cli import main
 from cmrl_jax.config import ConfigError
 from cmrl_jax.config_io import load_config, to_yaml
@@ -121,7 +122,7 @@ def test_titles_say_what_episodes_each_panel_shows_where_they_differ(tmp_path, m
     """A policy without z is inspected at k = 0, others after own experience."""
     pyplot, figures = _pyplot(), []
     monkeypatch.setattr(pyplot, "close", figures.append)
-    monkeypatch.setattr(pyplot.Figure, "savefig", lambda *_, **__: None)
+    monkeypatch.setattr(inspection_figures, "DPI", 10)  # drawn for its titles alone
     other = replace(inspection(), facts=FACTS | {"k": 0})
     for last in (inspection(), other):
         for plot in (plot_routing, plot_latents):
