@@ -5,7 +5,6 @@ A directory holds config.json and model.safetensors, or config.json and flax_mod
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from cmrl_jax.clip_text import CURE
 from cmrl_jax.config import ConfigError
+from cmrl_jax.documents import read_json
 
 REPOSITORY = "openai/clip-vit-base-patch32"
 # A commit that adds model.safetensors, the tensors of the published pytorch_model.bin, to the
@@ -76,14 +76,7 @@ def read_config(directory: Path) -> Mapping[str, Any]:
     Raises:
         ConfigError: it is no JSON object.
     """
-    path = directory / "config.json"
-    try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # text that is not UTF-8 too
-        raise ConfigError(f"{path} is not JSON: {error}", CURE) from None
-    if not isinstance(config, dict):
-        raise ConfigError(f"{path} holds no JSON object", CURE)
-    return config
+    return read_json(directory / "config.json", CURE)
 
 
 def read_tensors(model: Path) -> dict[str, np.ndarray]:

@@ -26,19 +26,26 @@ DPI = 150
 Panels = Sequence[tuple[str, Inspection]]  # name of a run, and what it was found to do
 
 
-def _title(name: str, inspection: Inspection) -> str:
-    return f"{name}, {inspection.facts['env_steps']:,} env steps"
+def _title(name: str, inspection: Inspection, shared: str) -> str:
+    """A panel's title, with the episodes that it shows where they are not those of all panels."""
+    title = f"{name}, {inspection.facts['env_steps']:,} env steps"
+    return title if shared else f"{title}\n{_episodes_of(inspection)}"
 
 
 def _row_name(inspection: Inspection, task: str) -> str:
     return task + (" (held out)" if inspection.is_held_out(task) else "")
 
 
-def _episodes(panels: Panels) -> str:
-    """The episodes that a figure shows, those of its first run."""
-    facts = panels[0][1].facts
+def _episodes_of(inspection: Inspection) -> str:
+    facts = inspection.facts
     count = facts["goals"] * facts["draws"]
     return f"evaluation episodes, k = {facts['k']}, {count} a task on '{facts['goal_set']}' goals"
+
+
+def _episodes(panels: Panels) -> str:
+    """The episodes that all panels show; nothing where they differ."""
+    found = {_episodes_of(inspection) for _, inspection in panels}
+    return found.pop() if len(found) == 1 else ""
 
 
 def plot_routing(pyplot: Any, panels: Panels, out: Path) -> Path:
@@ -53,11 +60,12 @@ def plot_routing(pyplot: Any, panels: Panels, out: Path) -> Path:
     figure, axes = pyplot.subplots(
         len(shapes), 1, figsize=(width, height), squeeze=False, layout="constrained"
     )
+    episodes = _episodes(panels)
     for axis, (name, inspection) in zip(axes[:, 0], panels, strict=True):
         _heat_map(figure, axis, inspection)
-        axis.set_title(_title(name, inspection), fontsize=10, pad=20)
+        axis.set_title(_title(name, inspection, episodes), fontsize=10, pad=20)
     what = "mean weight with which each module of the actor is read (least to most of its readers)"
-    figure.suptitle(f"{what}\n{_episodes(panels)}", fontsize=9)
+    figure.suptitle(f"{what}\n{episodes}".strip(), fontsize=9)
     save_figure(figure, out, "plot", dpi=DPI)
     pyplot.close(figure)
     return out
@@ -69,7 +77,8 @@ def _heat_map(figure: Any, axis: Any, inspection: Inspection) -> None:
     usage, gap = inspection.routing, 0.25
     assert usage is not None  # the caller has looked
     tasks, layers, modules = usage.mean.shape
-    norm, mesh, ticks = TwoSlopeNorm(1 / modules, 0, 1), None, []
+    # Of one module the equal share is 1, and white is still within the scale.
+    norm, mesh, ticks = TwoSlopeNorm(1 / modules, 0, max(1, 2 / modules)), None, []
     for layer in range(layers):
         left = layer * (modules + gap)
         edges = left + np.arange(modules + 1), np.arange(tasks + 1)
@@ -134,15 +143,17 @@ def plot_latents(pyplot: Any, panels: Panels, out: Path) -> Path:
     """
     rows, columns = -(-len(panels) // COLUMNS), min(COLUMNS, len(panels))
     cell, side = np.array([4.7, 5.9]), 3.7  # inches: legends lie outside the axes, below them
-    size = cell * (columns, rows) + (0, 0.3)
+    size, episodes = cell * (columns, rows) + (0, 0.3), _episodes(panels)
     figure = pyplot.figure(figsize=size)
     for index, (name, inspection) in enumerate(panels):
         row, column = divmod(index, COLUMNS)
         corner = cell * (column, rows - 1 - row) + (0.7, 1.35)
         axis = figure.add_axes((*(corner / size), *(side / size)))
         _latent_panel(axis, inspection)
-        axis.set_title(_title(name, inspection), fontsize=10, fontweight="bold", pad=34)
-    figure.suptitle(f"latent z of {_episodes(panels)}", fontsize=9, y=1 - 0.1 / size[1], va="top")
+        title = _title(name, inspection, episodes)
+        axis.set_title(title, fontsize=10, fontweight="bold", pad=34)
+    of = f"latent z of {episodes}" if episodes else "latent z"
+    figure.suptitle(of, fontsize=9, y=1 - 0.1 / size[1], va="top")
     save_figure(figure, out, "plot", dpi=DPI)
     pyplot.close(figure)
     return out

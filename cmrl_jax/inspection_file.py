@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from cmrl_jax.config import ConfigError
+from cmrl_jax.config import TASKS, ConfigError
+from cmrl_jax.documents import is_there, read_json
 from cmrl_jax.run_dir import cannot_write, write_text
 
 FILE = "inspection.json"
@@ -103,21 +104,59 @@ def read_inspection(run: Path) -> Inspection | None:
     Raises:
         ConfigError: the file cannot be read.
     """
-    path = run / FILE
-    if not path.is_file():
+    path, cure = run / FILE, "delete it, then make it again with plot --inspect"
+    if not is_there(path):
         return None
+    fields = read_json(path, cure)
     try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
         routing, latents = _arrays(fields["routing"]), _arrays(fields["latents"])
-        return Inspection(
+        found = Inspection(
             tasks=tuple(fields["tasks"]),
             routing=None if routing is None else Usage(**routing),
             latents=None if latents is None else Latents(**latents),
             facts=fields["facts"],
         )
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        cause = f"cannot read {path}: {error}"
-        raise ConfigError(cause, "delete it, then make it again with plot --inspect") from error
+        _check(found)
+    except KeyError as error:
+        raise ConfigError(f"{path} lacks the field {error}", cure) from error
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path} is no inspection: {error}", cure) from error
+    return found
+
+
+def _check(found: Inspection) -> None:
+    """Raises ValueError, TypeError or KeyError where a figure could not be drawn."""
+    tasks = found.tasks
+    if not tasks or len(set(tasks)) < len(tasks) or not set(tasks) <= set(TASKS):
+        raise ValueError(f"tasks are {tasks}")
+    for name in ("env_steps", "k", "goals", "draws"):
+        if type(found.facts[name]) is not int:
+            raise ValueError(f"{name} is {found.facts[name]!r}")
+    if not isinstance(found.facts["train_tasks"], list) or not found.facts["goal_set"]:
+        raise ValueError("train_tasks is no list, or goal_set is empty")
+    if (usage := found.routing) is not None:
+        _check_shape("routing", usage.mean, (len(tasks), None, None))
+        for array in (usage.low, usage.high):
+            _check_shape("routing", array, usage.mean.shape)
+    if (latents := found.latents) is not None:
+        _check_shape("mean", latents.mean, (len(tasks), None, None))
+        _check_shape("z", latents.z, latents.mean.shape)
+        _check_shape("kl", latents.kl, (len(tasks),))
+        _check_shape("text_mean", latents.text_mean, (len(tasks), latents.z.shape[-1]))
+        _check_shape("text_kl", latents.text_kl, (len(tasks),))
+
+
+def _check_shape(name: str, array: np.ndarray | None, shape: tuple[int | None, ...]) -> None:
+    if array is None:
+        if name in ("kl", "text_mean", "text_kl"):
+            return
+        raise ValueError(f"{name} is nothing")
+    got = array.shape
+    alike = len(got) == len(shape) and all(m in (None, n) for n, m in zip(got, shape, strict=True))
+    if not alike or 0 in got:
+        raise ValueError(f"{name} has the shape {got}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has a number that is not finite")
 
 
 def _plain(record: Usage | Latents | None) -> dict[str, Any] | None:

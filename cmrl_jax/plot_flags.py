@@ -25,7 +25,7 @@ def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
         type=typed_path,
         required=True,
         action="append",
-        help="run directory, again for more runs; DIR-seed0, DIR-seed1 are one band",
+        help="run directory, again for more; DIR-seed0, DIR-seed1 of one config are one band",
     )
     parser.add_argument(
         "--out", metavar="DIR", type=typed_path, help="directory [plots/ of the first]"

@@ -3,18 +3,15 @@
 From metrics.csv: success and return over env steps. From eval.json: the paper's bars and success
 by adaptation episodes. From inspection.json, which `--inspect` takes from the last policy
 checkpoint (inspection.py): routing and latents.
-Runs whose directories differ in `-seed<N>` alone are one group: its mean, and a band from the
-lowest to the highest.
+Runs that are seeds of one (run_groups.py) are one group: its mean, and a band from the lowest to
+the highest.
 """
 
 from __future__ import annotations
 
 import contextlib
-import csv
-import json
-import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,71 +22,88 @@ from cmrl_jax.config_io import read_yaml, resolve
 from cmrl_jax.flags import writable
 from cmrl_jax.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.inspection_file import read_inspection
+from cmrl_jax.run_files import (
+    EVALUATION,
+    Curve,
+    Evaluation,
+    Row,
+    find_evaluation,
+    read_metrics,
+)
+from cmrl_jax.run_groups import group_runs, settings_of, shown_names
 from envs.outputs import save_figure, written_by
 
 Series = list[tuple[float, float]]
 
 
-def read_metrics(run: Path) -> list[dict[str, str]]:
-    """Rows of a run's metrics.csv, as text.
-
-    Raises:
-        ConfigError: there is no such file, or it has no row.
-    """
-    path = run / "metrics.csv"
-    if not path.is_file():
-        raise ConfigError(f"{path} does not exist", "give --run a directory that holds a run")
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        raise ConfigError(f"{path} has no row yet", "let the run finish an iteration first")
-    return rows
-
-
-def series(rows: list[dict[str, str]], column: str) -> Series:
+def series(rows: Sequence[Row], column: str) -> Series:
     """(env steps, figure) wherever the column was filled."""
-    return [(float(row["env_steps"]), float(row[column])) for row in rows if row.get(column)]
-
-
-def group_name(run: Path) -> str:
-    """What runs of several seeds have in common: `cmrl` for runs/cmrl-seed1."""
-    return re.sub(r"-seed\d+$", "", run.resolve().name)
+    return [(row["env_steps"], row[column]) for row in rows if column in row]
 
 
 def band(curves: Sequence[Series]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Env steps, and mean, lowest and highest of curves where all have a figure, (point,) each.
 
-    Curves are read at the steps of the shortest, between their own points linearly.
+    A curve has one between its first point and its last, read linearly between two. The points are
+    those of all curves; none where curves do not overlap.
     """
-    shortest = np.array(min(curves, key=lambda c: c[-1][0]))
-    steps = shortest[:, 0]
-    values = np.array([np.interp(steps, *np.array(c).T) for c in curves])
+    points = [np.array(curve) for curve in curves]
+    first, last = max(p[0, 0] for p in points), min(p[-1, 0] for p in points)
+    steps = np.unique(np.concatenate([p[:, 0] for p in points]))
+    steps = steps[(first <= steps) & (steps <= last)]
+    values = np.array([np.interp(steps, *p.T) for p in points])
     return steps, values.mean(0), values.min(0), values.max(0)
 
 
+def final_evaluation(run: Path, rows: Sequence[Row]) -> Evaluation | None:
+    """A run's evaluation of where its rows end; one from before it went on is left out, and said.
+
+    Raises:
+        ConfigError: the file is damaged.
+    """
+    found = find_evaluation(run)
+    taken = found and found.facts.get("iteration")
+    if taken is None or "iteration" not in rows[-1] or taken == rows[-1]["iteration"] + 1:
+        return found
+    ends = f"the run stands at {rows[-1]['iteration'] + 1:.0f}"
+    print(f"{run / EVALUATION} is of iteration {taken} and left out: {ends}", file=sys.stderr)
+    return None
+
+
 class Runs:
-    """The runs of a figure: their rows, configurations and evaluations, by group."""
+    """The runs of a figure: their rows, configurations and evaluations, by group.
+
+    Raises:
+        ConfigError: a file of theirs is missing or damaged, or evaluations of seeds of one run were
+            not taken alike.
+    """
 
     def __init__(self, runs: Sequence[Path]):
         self.rows = {run: read_metrics(run) for run in runs}
         self.configs: dict[Path, Config] = {
             run: resolve(*read_yaml(run / "config.yaml")) for run in runs
         }
-        self.groups: dict[str, list[Path]] = {}
-        for run in runs:
-            self.groups.setdefault(group_name(run), []).append(run)
+        found = {run: final_evaluation(run, self.rows[run]) for run in runs}
+        self.evaluations = {run: e for run, e in found.items() if e is not None}
+        self.groups = group_runs({run: settings_of(c) for run, c in self.configs.items()})
+        for group in self.groups.values():
+            _check_alike({run: self.evaluations[run] for run in group if run in self.evaluations})
         self.tasks: list[str] = []
         for config in self.configs.values():
             for task in config.tasks.train + config.tasks.test:
                 if task not in self.tasks:
                     self.tasks.append(task)
 
+    def config(self, group: str) -> Config:
+        """The configuration that the runs of a group share, but for their seeds."""
+        return self.configs[self.groups[group][0]]
+
     def holds_out(self, group: str, task: str) -> bool:
-        """Whether no run of a group trains on a task."""
-        return not any(task in self.configs[run].tasks.train for run in self.groups[group])
+        """Whether a group does not train on a task."""
+        return task not in self.config(group).tasks.train
 
     def is_held_out(self, task: str) -> bool:
-        """Whether no run of the figure trains on a task."""
+        """Whether no group of the figure trains on a task."""
         return all(self.holds_out(group, task) for group in self.groups)
 
     def mark(self, group: str, task: str) -> str:
@@ -101,11 +115,28 @@ class Runs:
         found = [series(self.rows[run], column) for run in self.groups[group]]
         return [curve for curve in found if curve]
 
-    def final(self, group: str, task: str) -> list[dict[str, dict[str, float]]]:
-        """The final evaluation of a task, k -> figures, of every run of a group that has one."""
-        paths = [run / "eval.json" for run in self.groups[group]]
-        read = [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.is_file()]
-        return [result["tasks"][task] for result in read if task in result["tasks"]]
+    def final(self, group: str, task: str) -> list[Curve]:
+        """The final evaluation of a task, of every run of a group that has one, at the k of all."""
+        evaluations = [
+            self.evaluations[run] for run in self.groups[group] if run in self.evaluations
+        ]
+        found = [e.tasks[task] for e in evaluations if task in e.tasks]
+        shared = [k for k in found[0] if all(k in curve for curve in found)] if found else []
+        return [{k: curve[k] for k in shared} for curve in found] if shared else []
+
+
+def _check_alike(evaluations: Mapping[Path, Evaluation]) -> None:
+    """Raises ConfigError where evaluations that a mean is taken of were not taken with one setting.
+
+    Configurations may be equal and these not, since `eval --json` writes such files too.
+    """
+    for name in ("goals", "draws", "goal_set", "horizon", "seed", "physics", "policy", "z"):
+        values = {run: e.facts[name] for run, e in evaluations.items() if name in e.facts}
+        different = {str(value): run for run, value in values.items()}
+        if len(different) > 1:
+            shown = ", ".join(f"{value} in {run}" for value, run in different.items())
+            cause = f"the eval.json of seeds of one run were taken with another {name}: {shown}"
+            raise ConfigError(cause, "evaluate them alike, or plot each by itself")
 
 
 def _pyplot(needed_by: str = "plot") -> Any:
@@ -152,9 +183,15 @@ def _draw_band(axis: Any, curves: Sequence[Series], color: str, style: str, labe
     if not curves:
         return
     steps, mean, low, high = band(curves)
-    axis.plot(steps, mean, color=color, ls=style, lw=1.2, label=label)
+    if not len(steps):  # at no step do all have a figure: no mean, each by itself
+        for curve in curves:
+            _draw_band(axis, [curve], color, style, label)
+        return
+    one = len(steps) == 1  # a line or an area of one point is not seen
+    marker = "o" if one else None
+    axis.plot(steps, mean, color=color, ls=style, lw=1.2, marker=marker, ms=4, label=label)
     if len(curves) > 1:
-        axis.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
+        axis.fill_between(steps, low, high, color=color, alpha=0.2, lw=3 if one else 0)
 
 
 def plot_success(runs: Runs, out: Path) -> Path:
@@ -167,7 +204,7 @@ def plot_success(runs: Runs, out: Path) -> Path:
             for rule, style in (("any", "-"), ("last", ":")):
                 curves = runs.curves(group, f"train/{task}/success_{rule}")
                 _draw_band(axis, curves, color, style, f"{group}, training, {rule} step")
-            k = max(runs.configs[runs.groups[group][0]].eval.k)
+            k = max(runs.config(group).eval.k)
             label = f"{group}, evaluation k = {k}, any step{runs.mark(group, task)}"
             shape = "x" if runs.holds_out(group, task) else "o"
             for curve in runs.curves(group, f"eval/{task}/k{k}/success_any"):
@@ -186,7 +223,7 @@ def plot_returns(runs: Runs, out: Path) -> Path:
         for task, axis in panels.items():
             curves = runs.curves(group, f"train/{task}/return")
             _draw_band(axis, curves, color, "-", f"{group}, training")
-            k = max(runs.configs[runs.groups[group][0]].eval.k)
+            k = max(runs.config(group).eval.k)
             curves = runs.curves(group, f"eval/{task}/k{k}/return")
             label = f"{group}, evaluation k = {k}{runs.mark(group, task)}"
             style = ":" if runs.holds_out(group, task) else "--"
@@ -205,7 +242,7 @@ def plot_bars(runs: Runs, out: Path) -> Path:
             results = runs.final(group, task)
             if not results:
                 continue
-            k = max(results[0], key=int)
+            k = max(results[0])
             x = place + (index - (len(runs.groups) - 1) / 2) * width
             figures = [[r[k][f"success_{rule}"] for r in results] for rule in ("any", "last")]
             label = f"{group}, k = {k} (filled: last step){runs.mark(group, task)}"
@@ -230,8 +267,8 @@ def plot_k_shot(runs: Runs, out: Path) -> Path:
     for index, group in enumerate(runs.groups):
         for task, axis in panels.items():
             curves = [
-                [(float(k), figures["success_any"]) for k, figures in result.items()]
-                for result in runs.final(group, task)
+                [(float(k), figures["success_any"]) for k, figures in curve.items()]
+                for curve in runs.final(group, task)
             ]
             style = ":" if runs.holds_out(group, task) else "-"
             _draw_band(axis, curves, f"C{index}", style, group + runs.mark(group, task))
@@ -281,7 +318,7 @@ def plot_inspections(runs: Sequence[Path], out: Path) -> list[Path]:
         ConfigError: matplotlib is missing, an inspection.json cannot be read, or `out` written.
     """
     pyplot, drawn = _pyplot(), []
-    read = [(run.resolve().name, read_inspection(run)) for run in runs]
+    read = [(name, read_inspection(run)) for name, run in zip(shown_names(runs), runs, strict=True)]
     found = [(name, inspection) for name, inspection in read if inspection is not None]
     figures = (
         ("routing.png", plot_routing, "modules to route to", lambda x: x.routing),
@@ -317,12 +354,18 @@ def check_figure(path: Path, command: str, force: bool) -> None:
     writable(path, "--figure", written_by(command), force)
 
 
-def plot_adaptation(curves: dict[str, dict[str, dict[str, float]]], task: str, out: Path) -> Path:
-    """Success against episodes of own experience, a line for each way to adapt (`finetune`)."""
+def plot_adaptation(
+    curves: Mapping[str, Mapping[Any, Mapping[str, float]]], task: str, out: Path
+) -> Path:
+    """Success against episodes of own experience, a line for each way to adapt (`finetune`).
+
+    Args:
+        curves: way -> number of episodes, or its text as in JSON -> figures.
+    """
     pyplot = _pyplot()
     figure, axis = pyplot.subplots(figsize=(6, 3.6))
     for adapt, curve in curves.items():
-        points = [(int(n), figures["success_any"]) for n, figures in curve.items()]
+        points = sorted((int(n), figures["success_any"]) for n, figures in curve.items())
         axis.plot(*zip(*points, strict=True), "o-", ms=4, lw=1.2, label=adapt)
     axis.set_xscale("symlog", linthresh=1)
     axis.axhline(0.8, color="k", lw=0.6, ls=":")

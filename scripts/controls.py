@@ -8,7 +8,6 @@ text controls, one without z none at all. `table` is the Markdown of scripts/fig
 
 from __future__ import annotations
 
-import json
 import shlex
 import subprocess
 import sys
@@ -17,9 +16,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
-from cmrl_jax.config import Config  # noqa: E402
+from cmrl_jax.config import Config, ConfigError  # noqa: E402
 from cmrl_jax.config_io import read_yaml, resolve  # noqa: E402
-from scripts.experiments import RESULTS, RUNS  # noqa: E402
+from cmrl_jax.run_files import EVALUATION, read_evaluation  # noqa: E402
+from scripts.experiments import RESULTS, RUNS, refused  # noqa: E402
 
 CONTROLS = {
     "posterior": "",  # the protocol itself
@@ -58,18 +58,14 @@ def command(name: str, control: str) -> list[str]:
 def table(run: Path) -> list[str]:
     """Success at any step of every control, a row a control and a column a task; k side by side."""
     kept = {name: kept_file(run, name) for name in CONTROLS}
-    found = {
-        name: json.loads(path.read_text(encoding="utf-8"))["tasks"]
-        for name, path in kept.items()
-        if path.is_file()
-    }
+    found = {name: read_evaluation(path).tasks for name, path in kept.items() if path.is_file()}
     tasks = list(found["posterior"])
     head = [f"{run.name}, k = {K.replace(',', ', ')}", *tasks]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for name, by_task in found.items():
         cells = []
         for task in tasks:
-            figures = [by_task.get(task, {}).get(k) for k in K.split(",")]
+            figures = [by_task.get(task, {}).get(int(k)) for k in K.split(",")]
             cells.append(" ".join(f"{f['success_any']:.2f}" if f else "-" for f in figures))
         lines.append("| " + " | ".join([name, *cells]) + " |")
     return lines
@@ -80,12 +76,11 @@ def main(words: list[str]) -> int:
         for control in CONTROLS:
             print(f"python {shlex.join(command('NAME', control))}")
         return 0
-    finished = sorted(path.parent.name for path in (ROOT / RUNS).glob("*/eval.json"))
+    finished = sorted(path.parent.name for path in (ROOT / RUNS).glob(f"*/{EVALUATION}"))
     unknown = [name for name in words if name not in finished]
     if unknown or not words:
         cause = f"no finished run {unknown[0]} in {RUNS}" if unknown else "no run is named"
-        print(f"error: {cause}\nfix: choose from {', '.join(finished) or 'none yet'}")
-        return 2
+        return refused(cause, f"choose from {', '.join(finished) or 'none yet'}")
     for name in words:
         config = resolve(*read_yaml(ROOT / RUNS / name / "config.yaml"))
         for control in CONTROLS:
@@ -101,4 +96,7 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    try:
+        raise SystemExit(main(sys.argv[1:]))
+    except ConfigError as error:
+        raise SystemExit(refused(error.cause, error.cure)) from None

@@ -18,6 +18,12 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT)]
+
+from cmrl_jax.config import ConfigError  # noqa: E402
+from cmrl_jax.documents import read_csv  # noqa: E402
+from cmrl_jax.run_files import EVALUATION, METRICS, read_evaluation  # noqa: E402
+
 RUNS, RESULTS = Path("runs/experiments"), Path("results")
 CSV_ROWS = 100  # kept of a run's metrics
 
@@ -81,13 +87,15 @@ def command(name: str) -> list[str]:
 def keep(name: str) -> None:
     """Copies what results/ keeps of a finished run; the metrics thinned to `CSV_ROWS` rows."""
     run, kept = RUNS / name, RESULTS / name
+    # Read first: a damaged file does not take the place of the one that is kept.
+    header, by_line = read_csv(run / METRICS, "put it back from a copy, or run the experiment anew")
+    rows = list(by_line.values())
+    read_evaluation(run / EVALUATION)
     kept.mkdir(parents=True, exist_ok=True)
-    for file in ("config.yaml", "versions.json", "eval.json"):
+    for file in ("config.yaml", "versions.json", EVALUATION):
         shutil.copy(run / file, kept / file)
     if (run / "inspection.json").is_file():  # of `train.py plot --inspect`
         shutil.copy(run / "inspection.json", kept / "inspection.json")
-    with (run / "metrics.csv").open(encoding="utf-8", newline="") as file:
-        header, *rows = csv.reader(file)
     evaluated = [i for i, column in enumerate(header) if column.startswith("eval/")]
     stride = -(-len(rows) // CSV_ROWS)
     thinned = [
@@ -95,10 +103,16 @@ def keep(name: str) -> None:
         for i, row in enumerate(rows)
         if i % stride == 0 or i == len(rows) - 1 or any(row[c] for c in evaluated)
     ]
-    with (kept / "metrics.csv").open("w", encoding="utf-8", newline="") as file:
+    with (kept / METRICS).open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *thinned])
     spoken = f"python {shlex.join(command(name)).removesuffix(' --resume')}\n"
     (kept / "command.txt").write_text(spoken, encoding="utf-8")
+
+
+def refused(cause: str, cure: str) -> int:
+    """Says what a user got wrong, as train.py does; returns the exit code."""
+    print(f"error: {cause}\nfix: {cure}", file=sys.stderr)
+    return 2
 
 
 def main(words: list[str]) -> int:
@@ -107,17 +121,19 @@ def main(words: list[str]) -> int:
         return 0
     unknown = [word for word in words if word not in EXPERIMENTS]
     if unknown:
-        print(f"error: no experiment {unknown[0]}\nfix: choose from {', '.join(EXPERIMENTS)}")
-        return 2
+        return refused(f"no experiment {unknown[0]}", f"choose from {', '.join(EXPERIMENTS)}")
     for name in words or EXPERIMENTS:
-        if not (RUNS / name / "eval.json").exists():
+        if not (RUNS / name / EVALUATION).exists():
             print(f"== {name}", flush=True)
             code = subprocess.run([sys.executable, *command(name)], cwd=ROOT).returncode
-            if code or not (RUNS / name / "eval.json").exists():
+            if code or not (RUNS / name / EVALUATION).exists():
                 return code or 1  # stopped: the next call goes on with it
         keep(name)
     return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    try:
+        raise SystemExit(main(sys.argv[1:]))
+    except ConfigError as error:
+        raise SystemExit(refused(error.cause, error.cure)) from None

@@ -7,23 +7,27 @@ out, and figures of several runs with fewer than two.
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
-from cmrl_jax.config import TASKS  # noqa: E402
+from cmrl_jax.config import TASKS, ConfigError  # noqa: E402
 from cmrl_jax.config_io import read_yaml, resolve  # noqa: E402
 from cmrl_jax.inspection_file import FILE as INSPECTION  # noqa: E402
-from cmrl_jax.plots import (  # noqa: E402
-    plot_adaptation,
-    plot_inspections,
-    plot_learning,
+from cmrl_jax.plots import plot_adaptation, plot_inspections, plot_learning  # noqa: E402
+from cmrl_jax.run_files import (  # noqa: E402
+    EVALUATION,
+    METRICS,
+    Row,
+    figure,
+    read_adaptation,
+    read_evaluation,
     read_metrics,
 )
 from scripts import controls  # noqa: E402
+from scripts.experiments import refused  # noqa: E402
 
 RESULTS = ROOT / "results"
 # Table, and directory under results/figures -> runs under results/, whichever of them are there.
@@ -66,31 +70,30 @@ def table(runs: list[Path]) -> list[str]:
     head = ["run", "env steps", "gradient steps", "wall minutes", "steps to 0.9", "k", *TASKS]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for run in runs:
-        result = json.loads((run / "eval.json").read_text(encoding="utf-8"))
+        evaluation = read_evaluation(run / EVALUATION)
         config = resolve(*read_yaml(run / "config.yaml"))
         rows = read_metrics(run)
-        cells, k = [], ""
+        cells, k = [], max(max(by_k) for by_k in evaluation.tasks.values())
         for task in TASKS:
-            by_k = result["tasks"].get(task)
-            if by_k is None:
+            figures = evaluation.tasks.get(task, {}).get(k)
+            if figures is None:
                 cells.append("")
                 continue
-            k = max(by_k, key=int)
-            figures = by_k[k]
             held_out = " (held out)" if task in config.tasks.test else ""
             cells.append(f"{figures['success_any']:.2f} / {figures['success_last']:.2f}{held_out}")
-        wall = f"{float(rows[-1]['wall_s']) / 60:.1f}"
-        counts = [f"{int(rows[-1][name]):,}" for name in ("env_steps", "gradient_steps")]
+        last = lambda column: figure(rows[-1], column, run / METRICS)
+        counts = [f"{last(name):,.0f}" for name in ("env_steps", "gradient_steps")]
+        wall = f"{last('wall_s') / 60:.1f}"
         solved = steps_to_solve(rows, config.tasks.train, max(config.eval.k))
-        lines.append("| " + " | ".join([run.name, *counts, wall, solved, k, *cells]) + " |")
+        lines.append("| " + " | ".join([run.name, *counts, wall, solved, str(k), *cells]) + " |")
     return lines
 
 
-def steps_to_solve(rows: list[dict[str, str]], tasks: tuple[str, ...], k: int) -> str:
+def steps_to_solve(rows: list[Row], tasks: tuple[str, ...], k: int) -> str:
     """Env steps at the first evaluation where each of `tasks` succeeds on 0.9 of its goals."""
     for row in rows:
-        if min(float(row.get(f"eval/{task}/k{k}/success_any") or 0) for task in tasks) >= 0.9:
-            return f"{int(row['env_steps']):,}"
+        if min(row.get(f"eval/{task}/k{k}/success_any", 0) for task in tasks) >= 0.9:
+            return f"{row['env_steps']:,.0f}"
     return "-"
 
 
@@ -98,16 +101,16 @@ def adaptation_figures() -> list[Path]:
     """The curves of every results/finetune/RUN.json, a figure a task."""
     curves: dict[str, dict] = {}
     for file in sorted((RESULTS / "finetune").glob("*.json")):
-        result = json.loads(file.read_text(encoding="utf-8"))
-        named = {f"{file.stem}, {name}": curve for name, curve in result["curves"].items()}
-        curves.setdefault(result["task"], {}).update(named)
+        found = read_adaptation(file)
+        named = {f"{file.stem}, {way}": curve for way, curve in found.curves.items()}
+        curves.setdefault(found.task, {}).update(named)
     out = RESULTS / "finetune"
     return [plot_adaptation(found, task, out / f"{task}.png") for task, found in curves.items()]
 
 
 def main() -> int:
     kept = lambda names: [
-        RESULTS / name for name in names if (RESULTS / name / "eval.json").is_file()
+        RESULTS / name for name in names if (RESULTS / name / EVALUATION).is_file()
     ]
     drawn = []
     for folder, names in GROUPS.items():
@@ -126,4 +129,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except ConfigError as error:
+        raise SystemExit(refused(error.cause, error.cure)) from None

@@ -1,15 +1,17 @@
 """inspection.json and its figures, from arrays written here."""
 
+import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cmrl_jax import inspection_figures
 from cmrl_jax.cli import main
 from cmrl_jax.config import ConfigError
 from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.inspection_figures import between_tasks, verdict
+from cmrl_jax.inspection_figures import between_tasks, plot_latents, plot_routing, verdict
 from cmrl_jax.inspection_file import (
     Inspection,
     Latents,
@@ -18,6 +20,7 @@ from cmrl_jax.inspection_file import (
     write_inspection,
 )
 from cmrl_jax.pca import principal_axes
+from cmrl_jax.plots import _pyplot
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 FACTS = {"k": 2, "goals": 5, "draws": 2, "goal_set": "heldout", "env_steps": 1200000}
@@ -79,6 +82,67 @@ def test_a_file_that_is_none_is_refused(tmp_path):
         with pytest.raises(ConfigError) as error:
             read_inspection(tmp_path)
         assert "inspection.json" in error.value.cause and "--inspect" in error.value.cure
+
+
+DAMAGED = {
+    "list": (lambda d: [d], "holds no JSON object"),
+    "no facts": (lambda d: d | {"facts": []}, "is no inspection"),
+    "no k": (lambda d: d | {"facts": {**FACTS, "k": None}}, "k is None"),
+    "a fact less": (lambda d: d | {"facts": {"k": 2}}, "lacks the field 'env_steps'"),
+    "unknown task": (lambda d: d | {"tasks": [*TASKS[:3], "push"]}, "tasks are ('drawer-open'"),
+    "task twice": (lambda d: d | {"tasks": [TASKS[0]] * 4}, "tasks are"),
+    "no tasks": (lambda d: d | {"tasks": 3}, "is no inspection"),
+    "a task less": (lambda d: d | {"tasks": list(TASKS[:3])}, "routing has the shape (4, 2, 3)"),
+    "routing as list": (lambda d: d | {"routing": [1]}, "is no inspection"),
+    "a part less": (lambda d: d | {"routing": {"mean": d["routing"]["mean"]}}, "is no inspection"),
+    "flat z": (lambda d: d | {"latents": d["latents"] | {"z": [[1.0] * 6] * 4}}, "z has the shape"),
+    "ragged z": (lambda d: d | {"latents": d["latents"] | {"z": [[1.0], []]}}, "is no inspection"),
+    "no z": (lambda d: d | {"latents": d["latents"] | {"z": None}}, "z is nothing"),
+    "no draw": (
+        lambda d: d | {"latents": d["latents"] | {"mean": [[]] * 4}},
+        "has the shape (4, 0)",
+    ),
+    "kl of one": (lambda d: d | {"latents": d["latents"] | {"kl": [0.5]}}, "kl has the shape (1,)"),
+    "NaN": (lambda d: d | {"latents": d["latents"] | {"kl": [float("nan")] * 4}}, "NaN is no num"),
+    "overflow": (lambda d: d | {"latents": d["latents"] | {"kl": [None] * 4}}, "is not finite"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_a_damaged_file_is_refused_before_it_is_drawn(tmp_path, damage):
+    path = write_inspection(tmp_path, inspection(2.0, 1.5))
+    change, said = DAMAGED[damage]
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    with pytest.raises(ConfigError) as error:
+        read_inspection(tmp_path)
+    assert "inspection.json" in error.value.cause and said in error.value.cause
+
+
+def test_titles_say_what_episodes_each_panel_shows_where_they_differ(tmp_path, monkeypatch):
+    """A policy without z is inspected at k = 0, others after own experience."""
+    pyplot, figures = _pyplot(), []
+    monkeypatch.setattr(pyplot, "close", figures.append)
+    monkeypatch.setattr(inspection_figures, "DPI", 10)  # drawn for its titles alone
+    other = replace(inspection(), facts=FACTS | {"k": 0})
+    for last in (inspection(), other):
+        for plot in (plot_routing, plot_latents):
+            plot(pyplot, [("x", inspection()), ("y", last)], tmp_path / "f.png")
+    monkeypatch.undo()
+    pyplot.close("all")
+    whole = [figure.get_suptitle() for figure in figures]
+    panels = [[axis.get_title() for axis in figure.axes if axis.get_title()] for figure in figures]
+    for n in (0, 1):
+        assert "k = 2, 10 a task" in whole[n]
+        assert panels[n] == ["x, 1,200,000 env steps", "y, 1,200,000 env steps"]
+    for n in (2, 3):
+        assert "k = " not in whole[n]
+        assert "k = 2, 10 a task" in panels[n][0] and "k = 0, 10 a task" in panels[n][1]
+
+
+def test_one_module_a_layer_is_drawn(tmp_path):
+    whole = np.ones((4, 2, 1))
+    alone = replace(inspection(), routing=Usage(whole, whole, whole))
+    assert min(size_of(plot_routing(_pyplot(), [("x", alone)], tmp_path / "routing.png"))) > 100
 
 
 def test_figures_need_no_checkpoint(run, capsys):
