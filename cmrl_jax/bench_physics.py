@@ -15,10 +15,10 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 
+from envs.engine import mujoco
 from envs.model import load_scene
 from envs.sawyer import ACTION_SIZE, Ml4Env
 from envs.tasks import TASKS

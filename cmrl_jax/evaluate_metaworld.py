@@ -21,6 +21,8 @@ from typing import Any
 
 import jax
 import numpy as np
+
+import envs.engine  # noqa: F401  # isort: skip, metaworld imports MuJoCo
 from gymnasium.vector import SyncVectorEnv
 from metaworld.evaluation import Timestep, metalearning_evaluation
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import mujoco
 import numpy as np
 
+from envs.engine import mujoco
 from envs.model import FIXTURE_BODY, FIXTURE_ROOT
 
 BOXES = 19  # slots a scene; unused ones are parked far below the floor

@@ -89,6 +89,7 @@ def draw_goals(task: str, seed: int) -> np.ndarray:
         ValueError: metaworld is not installed.
     """
     try:
+        import envs.engine  # noqa: F401  # isort: skip, metaworld imports MuJoCo
         import metaworld
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
     except ImportError as error:

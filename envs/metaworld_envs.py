@@ -10,6 +10,7 @@ import pickle
 from collections import OrderedDict
 from typing import Any
 
+import envs.engine  # noqa: F401  # isort: skip, metaworld imports MuJoCo
 import metaworld
 import numpy as np
 from gymnasium.vector import SyncVectorEnv

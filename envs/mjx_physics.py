@@ -77,7 +77,7 @@ class MjxPhysics:
         )
 
     def _read_constants(self, model: Any) -> None:
-        import mujoco
+        from envs.engine import mujoco
 
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)

@@ -14,8 +14,9 @@ import importlib.util
 from pathlib import Path
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
+
+from envs.engine import mujoco
 
 SCENES = {"drawer": "sawyer_drawer.xml", "window": "sawyer_window_horizontal.xml"}
 FIXTURE_BODY = {"drawer": "drawer_link", "window": "windowb_a"}

@@ -27,10 +27,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
 
+from envs.engine import mujoco
 from envs.model import FIXTURE_BODY, FIXTURE_ROOT, SCENES, SLIDE, Fixture, load_fixture, load_scene
 from envs.physics import FRAME_SKIP, MOCAP_QUAT, Positions, settled_starts
 from envs.tasks import ACTION_SCALE, HAND_HIGH, HAND_LOW, SCENE_ID

@@ -10,10 +10,10 @@ import functools
 from typing import Any, NamedTuple, Protocol
 
 import jax
-import mujoco
 import numpy as np
 from flax import struct
 
+from envs.engine import mujoco
 from envs.model import SLIDE, Fixture, load_scene
 from envs.tasks import SPECS, Task
 

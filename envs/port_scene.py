@@ -9,9 +9,9 @@ from __future__ import annotations
 import itertools
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
+from envs.engine import mujoco
 from envs.geometry import FixtureShapes, Gripper, load_gripper, load_shapes
 from envs.model import (
     ARM_JOINTS,

@@ -3,6 +3,8 @@
 import contextlib
 import io
 
+import envs.engine  # noqa: F401  # MuJoCo before mjx imports it
+
 with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx as mjx
 

@@ -25,8 +25,9 @@ import warnings
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-import mujoco
 import numpy as np
+
+from envs.engine import mujoco  # isort: skip, metaworld imports MuJoCo
 from metaworld import policies
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.sawyer_xyz_env import SawyerXYZEnv

@@ -2,6 +2,7 @@
 
 MuJoCo chooses its GL library when it is first imported, from the environment variable MUJOCO_GL.
 So a command calls `choose_gl` before anything imports mujoco; a variable the user has set wins.
+What draws nothing does without: `engine.py`.
 """
 
 from __future__ import annotations
@@ -14,9 +15,20 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    import mujoco
+    from envs.engine import mujoco
 
-_PROBE = "import mujoco; c = mujoco.GLContext(8, 8); c.make_current(); c.free()"
+# Draws one picture. A context alone would not do: a display that cannot be opened has one too.
+_PROBE = """
+import mujoco
+scene = "<mujoco><worldbody><light pos='0 0 9'/><geom size='1'/></worldbody></mujoco>"
+model = mujoco.MjModel.from_xml_string(scene)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 32, 32) as renderer:
+    renderer.update_scene(data)
+    raise SystemExit(not renderer.render().any())
+"""
+_PROBE_SECONDS = 60  # a display may belong to a machine that does not answer
 
 
 class Camera(NamedTuple):
@@ -59,30 +71,43 @@ def metaworld_scene(task: str, placement: np.ndarray) -> mujoco.MjModel:
 def choose_gl() -> None:
     """Makes sure that MuJoCo can draw in this process; to be called before it is imported.
 
-    Without MUJOCO_GL and without a display it is set to the first of egl and osmesa that works,
-    for this process and those it starts. Each is tried in a process of its own, since a failure
-    inside `import mujoco` could not be undone.
+    Without MUJOCO_GL it is set, for this process and those it starts, to the first of egl and
+    osmesa that draws, unless there is a display that does.
 
     Raises:
-        ValueError: none works. The message is two lines: cause, cure.
+        ValueError: none draws. The message is two lines: cause, cure.
     """
-    wished = os.environ.get("MUJOCO_GL", "")
+    wished = os.environ.get("MUJOCO_GL", "").strip()
     names = [wished]
     if not wished and sys.platform == "linux":
-        has_display = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
-        names = [""] * has_display + ["egl", "osmesa"]
+        has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        names = ["", "egl", "osmesa"] if has_display else ["egl", "osmesa"]
     for name in names:
-        environment = os.environ | {"MUJOCO_GL": name} if name else None
-        probe = subprocess.run(
-            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, check=False
-        )
-        if probe.returncode == 0:
+        if _draws(name):
             if name:
                 os.environ["MUJOCO_GL"] = name
             return
     tried = f"MUJOCO_GL={wished} does not work here" if wished else "no GL library works here"
-    raise ValueError(
-        f"pictures need OpenGL, and {tried}\n"
+    raise _cannot_draw(tried)
+
+
+def _draws(gl: str) -> bool:
+    """Whether MuJoCo draws with a value of MUJOCO_GL, in a process of its own: a failure inside
+    `import mujoco` or GL could not be undone."""
+    command = [sys.executable, "-c", _PROBE]
+    environment = os.environ | {"MUJOCO_GL": gl}
+    try:
+        probe = subprocess.run(
+            command, env=environment, capture_output=True, check=False, timeout=_PROBE_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return probe.returncode == 0
+
+
+def _cannot_draw(reason: str) -> ValueError:
+    return ValueError(
+        f"pictures need OpenGL, and {reason}\n"
         "on Debian or Ubuntu: apt-get install libegl1 libosmesa6; MUJOCO_GL=egl or "
         "MUJOCO_GL=osmesa takes one of them for certain"
     )
@@ -94,11 +119,16 @@ class Renderer:
     Args:
         model: any MuJoCo model; its off-screen buffer is enlarged where it is too small.
         width, height: of a picture, pixels.
+
+    Raises:
+        ValueError: MuJoCo was imported without GL (two lines: cause, cure).
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):
-        import mujoco
+        from envs.engine import mujoco
 
+        if not hasattr(mujoco, "GLContext"):
+            raise _cannot_draw("MuJoCo could not load it in this process")
         buffer = model.vis.global_
         buffer.offwidth, buffer.offheight = (
             max(buffer.offwidth, width),
@@ -120,7 +150,7 @@ class Renderer:
 
     def draw(self, qpos: np.ndarray, camera: Camera) -> np.ndarray:
         """A picture (height, width, 3) uint8 of a state qpos (nq,) as the camera sees it."""
-        import mujoco
+        from envs.engine import mujoco
 
         self._data.qpos[:] = qpos
         mujoco.mj_forward(self._model, self._data)  # pyright: ignore[reportAttributeAccessIssue]

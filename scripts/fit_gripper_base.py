@@ -12,11 +12,11 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import optax
 from scipy.spatial import ConvexHull
 
+from envs.engine import mujoco
 from envs.geometry import BASE_FILE
 from envs.model import load_scene
 

@@ -1,5 +1,6 @@
 """`train.py render`: the states it shows are those that the evaluation counts, and Meta-World's."""
 
+import os
 import re
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
+from policy_fixtures import save_run
 
 from cmrl_jax.checkpoint import policy_store
 from cmrl_jax.config_io import load_config, to_yaml
@@ -78,6 +80,18 @@ def test_a_film_is_the_evaluation_itself(session, params):
             assert episode.qpos.shape == (21, 10)
     first, second = films[0].episodes
     assert not np.array_equal(first.qpos, second.qpos)  # another z
+
+
+def test_an_evaluation_needs_no_gl(session, tmp_path):
+    run = save_run(tmp_path / "run", session, seeds=(1,))
+    words = ["eval", "--run", str(run), "--k", "0", "--goals", "1", "--horizon", "10"]
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), *words],
+        env=os.environ | {"MUJOCO_GL": "no-such-library"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0 and "window-close" in done.stdout, done.stderr
 
 
 def test_verdict_names_the_first_success():
@@ -183,7 +197,10 @@ def test_render_films_a_policy_checkpoint(gl, session, params, tmp_path):
         store.save({"policy": policy}, meta)
     words = ["render", "--run", str(tmp_path), "--horizon", "20", "--every", "10"]
     done = subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), *words], capture_output=True, text=True
+        [sys.executable, str(ROOT / "train.py"), *words],
+        env=os.environ | {"DISPLAY": ":4242"},  # that of a session which is over
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     for task in session.eval_tasks:

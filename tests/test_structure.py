@@ -178,6 +178,19 @@ def test_each_library_has_its_room():
     assert not at_import & {"transformers", "huggingface_hub", "matplotlib"}
 
 
+def test_mujoco_is_imported_in_one_place():
+    """By `envs.engine`, for which no GL library need be there; metaworld and brax come after it."""
+    guard = re.compile(r"\s*(import|from) envs\.(engine|quiet_mjx|mjx_physics)\b")
+    foreign = re.compile(r"\s*(import|from) (mujoco|metaworld|brax)\b")
+    for name in (importers("mujoco") | importers("metaworld") | importers("brax")) - {
+        "envs.engine"
+    }:
+        lines = MODULES[name].read_text().splitlines()
+        guards = [i for i, line in enumerate(lines) if guard.match(line)]
+        late = [i for i, line in enumerate(lines) if foreign.match(line)]
+        assert guards and guards[0] < min(late), name
+
+
 def test_training_and_evaluation_need_no_encoder():
     """Only the commands that turn sentences into vectors reach one."""
     encoder = {"encoders", "minilm", "clip_text", "clip_tokenizer", "clip_weights"}
