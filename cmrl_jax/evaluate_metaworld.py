@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import envs.engine  # noqa: F401  # isort: skip, metaworld imports MuJoCo
@@ -38,6 +39,7 @@ from cmrl_jax.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.settings import describe, horizon_of, result_fields, row_columns
 from cmrl_jax.trials import evaluation_config, trial_of
 from envs.metaworld_envs import MAX_HORIZON, make_vector_env, set_goals
+from envs.tasks import task_id
 
 ENVIRONMENTS = 10  # side by side in our own protocol: 18 MB each, and one call of the policy
 
@@ -150,6 +152,7 @@ def agent_of(
 ) -> MetaWorldAgent:
     """The agent of a trial of one task, whose adaptation runs take these lanes of it in turn."""
     names, train = lane_names(trial), session.config.tasks.train
+    [task] = trial.tasks
     texts = np.repeat(trial.texts[0, 0], trial.draws, axis=0)  # (lane, G)
     return MetaWorldAgent(
         session.config,
@@ -157,7 +160,8 @@ def agent_of(
         policy.params,
         texts=np.stack([texts[lanes] for lanes in runs]),
         lane_ids=np.stack([names[lanes] for lanes in runs]),
-        train_row=train.index(trial.tasks[0]) if trial.tasks[0] in train else 0,
+        train_row=train.index(task) if task in train else 0,
+        reset_lag=np.asarray(session.env.reset_lag(jnp.asarray(task_id(task)))),
         horizon=horizon,
         seed=seed,
         z=trial.z,

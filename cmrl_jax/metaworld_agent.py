@@ -13,6 +13,8 @@ NOTES
    nothing.
 4. A lane's z and the noise of its actions are those that `Evaluator` draws for the same lane name
    and episode number; evaluation episodes go on counting where adaptation stopped.
+5. Canonical observations are seen from where the object stands, and an agent is shown nothing but
+   observations: it adds to the reset's what that one lags behind, as `Ml4Env` does.
 """
 
 from __future__ import annotations
@@ -59,6 +61,7 @@ class MetaWorldAgent:
         texts: text vectors (run, lane, G); adaptation run n takes row n modulo their number.
         lane_ids: names of the lanes' noise (run, lane), see `Evaluator`.
         train_row: the task's row among the training tasks, read where the policy is told the task.
+        reset_lag: the task's `Ml4Env.reset_lag` (3,), metres (NOTE 5).
         horizon: control steps of an episode.
         seed: seed of the draws.
         z: posterior, or one of the controls prior and text.
@@ -73,6 +76,7 @@ class MetaWorldAgent:
         texts: np.ndarray,
         lane_ids: np.ndarray,
         train_row: int,
+        reset_lag: np.ndarray,
         horizon: int,
         seed: int = 0,
         z: str = "posterior",
@@ -80,6 +84,7 @@ class MetaWorldAgent:
     ):
         self._texts, self._lane_ids, self._z = texts, lane_ids, z
         self._lanes, self._horizon = lane_ids.shape[1], horizon
+        self._reset_lag = reset_lag
         self._inference = learner.inference
         self._key = jax.random.key(seed)
         self._run = -1
@@ -165,7 +170,7 @@ class MetaWorldAgent:
             noise = self._functions["noise"](self._key, self._episode, self._lane_id)
             self._zc[self._starts] = np.asarray(self._draw())[self._starts]
             self._noise[self._starts] = np.asarray(noise)[self._starts]
-            self._origin[self._starts] = obs[self._starts][:, OBJECT]
+            self._origin[self._starts] = obs[self._starts][:, OBJECT] + self._reset_lag
             self._steps[self._starts] = 0
             self._starts[:] = False
         noise = self._noise[np.arange(self._lanes), self._steps]
