@@ -21,7 +21,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from cmrl_jax.config import Config, ConfigError
-from cmrl_jax.config_io import check_resumable
+from cmrl_jax.config_io import check_origin, check_resumable
 from cmrl_jax.manifest import find_damage, fingerprint, is_listed, write_manifest
 from cmrl_jax.named_arrays import describe, flatten, not_finite, placed, unflatten
 from cmrl_jax.old_statistics import as_stored, brought_up
@@ -161,13 +161,15 @@ class CheckpointStore:
             versions: this process's `package_versions()`; a difference prints one warning line.
 
         Raises:
-            ConfigError: no such step, it cannot be read, the config differs in a field that
-                matters, or the arrays differ from `abstract`. Each names what and a cure.
+            ConfigError: no such step, it cannot be read, its policy saw observations from another
+                origin, the config differs in a field that matters, or the arrays differ from
+                `abstract`. Each names what and a cure.
         """
         step = self._choose(step)
         if reason := find_damage(self.directory / str(step)):
             raise self._damaged(step, reason)
         meta = self.read_meta(step)
+        check_origin(meta["config"], self.directory.parent)
         if config is not None:
             check_resumable(meta["config"], config, self.directory.parent)
         if versions is not None:

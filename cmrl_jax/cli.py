@@ -25,6 +25,7 @@ from cmrl_jax.config_io import (
     find_config,
     read_yaml,
     resolve,
+    run_config,
     to_yaml,
 )
 from cmrl_jax.flags import Parser, add_force, distinct, names, parse, parser_of, shown, writable
@@ -221,7 +222,7 @@ def _finetune(words: list[str]) -> int:
     parser = parser_of("finetune", finetune_flags.DESCRIPTION)
     args = parse(finetune_flags.add_flags(parser), words)
     options, run = finetune_flags.options_of(args), find_run(args.run)
-    finetune_flags.check_run(resolve(*read_yaml(run / "config.yaml")), options)
+    finetune_flags.check_run(run_config(run), options)
     distinct(json=args.json, figure=args.figure)
     writable(args.json, "--json", written_by("finetune"), args.force)
     if args.figure is not None:

@@ -92,6 +92,10 @@ class EnvConfig:
     obs_mode: Literal["metaworld", "canonical"] = doc(
         "metaworld", "as Meta-World's, or canonical: relative to where the object began"
     )
+    # Recorded so that a policy is never shown observations from another origin than it learned by.
+    origin: Literal["settled"] = doc(
+        "settled", "where canonical observations have it: the object as it stands after the reset"
+    )
 
 
 @dataclass(frozen=True)

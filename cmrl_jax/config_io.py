@@ -106,10 +106,10 @@ def changed_fields(saved: Mapping[str, Any], config: Config) -> list[tuple[str, 
 
     Args:
         saved: `to_dict` of the run's config, or the same read back from YAML or JSON. A field it
-            lacks was added later and counts as its default.
+            lacks was added later and counts as what such a run was made with.
         config: the config to go on with.
     """
-    old = dict(_flat(saved))
+    old = _recorded(saved)
     changed = []
     for dotted, f, new in leaves(config):
         before = old.pop(dotted, f.default)
@@ -122,6 +122,7 @@ def changed_fields(saved: Mapping[str, Any], config: Config) -> list[tuple[str, 
 
 def check_resumable(saved: Mapping[str, Any], config: Config, run: Path) -> None:
     """Raises ConfigError naming the fields in which `config` differs from the run's own."""
+    check_origin(saved, run)
     changed = changed_fields(saved, config)
     if changed:
         shown = "; ".join(f"{name}: {_show(old)} -> {_show(new)}" for name, old, new in changed)
@@ -130,6 +131,40 @@ def check_resumable(saved: Mapping[str, Any], config: Config, run: Path) -> None
             f"resume with {quoted('--config', run / 'config.yaml')}, or start a new run without "
             "--resume",
         )
+
+
+def _recorded(saved: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's config by dotted name. A key it lacks had its default, but for one: `canonical` runs
+    once took their origin from the reset observation, which need not show where the object is."""
+    record = dict(_flat(saved))
+    if record.get("env.obs_mode") == "canonical":
+        record.setdefault("env.origin", "reset observation")
+    return record
+
+
+def check_origin(saved: Mapping[str, Any], run: Path) -> None:
+    """Raises ConfigError if a run's policy saw another origin; `saved` as in `changed_fields`."""
+    old, new = _recorded(saved).get("env.origin"), Config().env.origin
+    if old not in (None, new):
+        raise ConfigError(
+            f"{run} saw canonical observations from another origin: env.origin: {old} -> {new}",
+            f"train anew with {quoted('--config', run / 'config.yaml')}; its figures can be drawn",
+        )
+
+
+def run_config(run: Path, acts: bool = True) -> Config:
+    """The configuration of a run, from its own config.yaml.
+
+    Args:
+        acts: whether its policy is to act, so that it must see what it learned by.
+
+    Raises:
+        ConfigError: it cannot be read, or the policy would see something else.
+    """
+    data, source = read_yaml(run / "config.yaml")
+    if acts:
+        check_origin(data, run)
+    return resolve(data, source)
 
 
 def config_dirs() -> list[Path]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from cmrl_jax.config import MOST_EPISODES, TASKS, Config, ConfigError, suggest
-from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.config_io import run_config
 from cmrl_jax.flags import (
     adaptation,
     add_force,
@@ -252,7 +252,7 @@ def check_run(options: EvalOptions, run: Path) -> Config:
     Raises:
         ConfigError: no run there, or one to which an option does not apply.
     """
-    config = resolve(*read_yaml(find_run(run) / "config.yaml"))
+    config = run_config(find_run(run))
     conditioning, fusion = config.model.conditioning, config.encoder.goal_fusion
     k = options.k if options.k is not None else config.eval.final_k
     tasks = evaluated_tasks(options, config)

@@ -12,7 +12,7 @@ import numpy as np
 from cmrl_jax.checkpoint import full_store, join_run, split_run
 from cmrl_jax.collect import init_run
 from cmrl_jax.config import Config, call_envs
-from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.config_io import run_config
 from cmrl_jax.finetune import (
     FineTuning,
     Score,
@@ -39,7 +39,7 @@ def finetune_run(
     Raises:
         ConfigError: no checkpoint, another goal table than the run's, or it cannot be adapted so.
     """
-    config = resolve(*read_yaml(run / "config.yaml"))
+    config = run_config(run)
     check_run(config, options)
     # From here on the physics really used, for the results' record.
     options = replace(options, physics=options.physics or config.env.physics)

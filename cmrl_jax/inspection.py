@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.config_io import run_config
 from cmrl_jax.distributions import Gaussian, kl_to_standard_normal
 from cmrl_jax.episode import Lanes, PolicyParams, lane_noise, noise_key
 from cmrl_jax.evaluate import Evaluator, Trial
@@ -39,7 +39,7 @@ def inspect_run(run: Path) -> Path | None:
         ConfigError: no such checkpoint, it does not fit this program, or the directory refuses
             the file.
     """
-    model = resolve(*read_yaml(run / "config.yaml")).model
+    model = run_config(run).model
     if model.conditioning != "z" and not (model.net == "soft" and model.modular_actor):
         return None
     config = evaluation_config(run, "native")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cmrl_jax.config import ConfigError
+from cmrl_jax.config_io import run_config
 from cmrl_jax.flags import add_force
 from cmrl_jax.run_dir import find_run
 from envs.command_line import typed_path
@@ -55,9 +56,10 @@ def check_inspectable(run: Path) -> None:
     """Whether `--inspect` finds a policy in a run.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: it does not, or this version could not act by it.
     """
     if not (find_run(run) / "policy").is_dir():
         cause = f"--inspect needs a policy checkpoint, and {run / 'policy'} does not exist"
         cure = "let the run reach one (checkpoint.policy_every), or leave --inspect out"
         raise ConfigError(cause, cure)
+    run_config(run)

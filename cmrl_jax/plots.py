@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from cmrl_jax.config import Config, ConfigError, as_config_error
-from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.config_io import run_config
 from cmrl_jax.flags import writable
 from cmrl_jax.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.inspection_file import read_inspection
@@ -80,9 +80,7 @@ class Runs:
 
     def __init__(self, runs: Sequence[Path]):
         self.rows = {run: read_metrics(run) for run in runs}
-        self.configs: dict[Path, Config] = {
-            run: resolve(*read_yaml(run / "config.yaml")) for run in runs
-        }
+        self.configs: dict[Path, Config] = {run: run_config(run, acts=False) for run in runs}
         found = {run: final_evaluation(run, self.rows[run]) for run in runs}
         self.evaluations = {run: e for run, e in found.items() if e is not None}
         self.groups = group_runs({run: settings_of(c) for run, c in self.configs.items()})

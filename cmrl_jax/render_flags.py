@@ -7,7 +7,7 @@ import importlib.util
 from typing import Any
 
 from cmrl_jax.config import ConfigError, call_envs
-from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.config_io import run_config
 from cmrl_jax.flags import add_force, episodes, goal_index, natural, seed, steps, writable
 from cmrl_jax.run_dir import find_run
 from cmrl_jax.validate import check_goal_set
@@ -46,7 +46,7 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     """
     check_goal_set(args.goal_set, "--goal-set")
     run = find_run(args.run)
-    config = resolve(*read_yaml(run / "config.yaml"))
+    config = run_config(run)
     has_latent = config.model.conditioning == "z"
     if args.k and not has_latent:
         cause = f"--k {args.k} with model.conditioning {config.model.conditioning}"

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from cmrl_jax.config import Config, ConfigError
-from cmrl_jax.config_io import read_yaml, resolve
+from cmrl_jax.config_io import run_config
 from cmrl_jax.controls import other_task, text_per_goal
 from cmrl_jax.evaluate import Trial
 from cmrl_jax.evaluate_flags import EvalOptions
@@ -26,7 +26,7 @@ MEMORY_SHARE = 0.7
 
 def evaluation_config(run: Path, physics: Literal["mjx", "native"] | None) -> Config:
     """A run's configuration with the backend to evaluate in; None for the one it was trained in."""
-    config = resolve(*read_yaml(run / "config.yaml"))
+    config = run_config(run)
     if physics is None:
         return config
     # A policy does not know its simulator. impl belongs to mjx, and its default serves both.

@@ -31,7 +31,7 @@ def _load_gl() -> None:
     platform = os.environ.get("PYOPENGL_PLATFORM")
     try:
         context = importlib.reload(sys.modules["mujoco.rendering.classic.gl_context"])
-        sys.modules["mujoco"].GLContext = context.GLContext
+        vars(sys.modules["mujoco"])["GLContext"] = context.GLContext
     except Exception:  # of any kind: it comes out of PyOpenGL and of ctypes
         # Set by MuJoCo on its way to the library; it would mislead a process started with another.
         os.environ.pop("PYOPENGL_PLATFORM", None)

@@ -131,7 +131,7 @@ class Ml4Env:
         Zero but for window-close, see the NOTE in `tasks.py`.
         """
         axis = self.physics.fixture(self._scene_id[task_id]).axis
-        return axis * (self.tasks.start_slide - self.tasks.first_obs_slide)[task_id]
+        return (self.tasks.start_slide - self.tasks.first_obs_slide)[task_id] * axis
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step; `action` (4,) in [-1, 1]: hand displacement / 0.01 m, finger effort."""

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from cmrl_jax.config import Config, ConfigError  # noqa: E402
-from cmrl_jax.config_io import read_yaml, resolve  # noqa: E402
+from cmrl_jax.config_io import run_config  # noqa: E402
 from cmrl_jax.run_files import EVALUATION, read_evaluation  # noqa: E402
 from scripts.experiments import RESULTS, RUNS, refused  # noqa: E402
 
@@ -82,7 +82,7 @@ def main(words: list[str]) -> int:
         cause = f"no finished run {unknown[0]} in {RUNS}" if unknown else "no run is named"
         return refused(cause, f"choose from {', '.join(finished) or 'none yet'}")
     for name in words:
-        config = resolve(*read_yaml(ROOT / RUNS / name / "config.yaml"))
+        config = run_config(ROOT / RUNS / name)
         for control in CONTROLS:
             kept = kept_file(ROOT / RESULTS / name, control)
             if kept.exists() or not applies(control, config):

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from cmrl_jax.config import TASKS, ConfigError  # noqa: E402
-from cmrl_jax.config_io import read_yaml, resolve  # noqa: E402
+from cmrl_jax.config_io import run_config  # noqa: E402
 from cmrl_jax.inspection_file import FILE as INSPECTION  # noqa: E402
 from cmrl_jax.plots import plot_adaptation, plot_inspections, plot_learning  # noqa: E402
 from cmrl_jax.run_files import (  # noqa: E402
@@ -71,7 +71,7 @@ def table(runs: list[Path]) -> list[str]:
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for run in runs:
         evaluation = read_evaluation(run / EVALUATION)
-        config = resolve(*read_yaml(run / "config.yaml"))
+        config = run_config(run, acts=False)
         rows = read_metrics(run)
         cells, k = [], max(max(by_k) for by_k in evaluation.tasks.values())
         for task in TASKS:

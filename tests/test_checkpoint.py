@@ -24,6 +24,7 @@ from checkpoint_fixtures import (
 
 from cmrl_jax import checkpoint
 from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config_io import to_dict
 from cmrl_jax.normalizers import init_obs_stats, init_return_stats
 
 
@@ -152,6 +153,22 @@ def test_a_changed_setting_is_refused_by_name_before_any_array(tmp_path):
     changed = dataclasses.replace(Config(), seed=5)
     cause, cure = cause_and_cure(tmp_path, config=changed)
     assert "seed: 0 -> 5" in cause and "config.yaml" in cure
+
+
+def test_another_origin_of_what_the_policy_saw_is_refused_by_name(tmp_path):
+    """Whatever config.yaml says: the checkpoint has a record of its own."""
+    for mode in ("metaworld", "canonical"):
+        record = to_dict(Config())
+        record["env"]["obs_mode"] = mode
+        del record["env"]["origin"]  # as runs of old
+        with checkpoint.policy_store(tmp_path / mode) as store:
+            store.save({"policy": {"actor": jnp.ones(2)}}, make_meta(1, config=record))
+    abstract = {"policy": {"actor": jax.ShapeDtypeStruct((2,), jnp.float32)}}
+    with checkpoint.policy_store(tmp_path / "metaworld", read_only=True) as store:
+        store.restore(abstract)
+    with checkpoint.policy_store(tmp_path / "canonical", read_only=True) as store:
+        with pytest.raises(ConfigError, match="env.origin: reset observation -> settled"):
+            store.restore(abstract)
 
 
 @pytest.mark.parametrize(

@@ -195,7 +195,7 @@ def test_ml4_names_every_key_that_matters():
     assert left_out == {
         "model.mlp_hidden", "model.router_shared", "model.critic_bins", "model.critic_v_max",
         "model.critic_agg", "encoder.aux", "encoder.aux_weight", "encoder.z_resample",
-        "collect.own_context",
+        "collect.own_context", "env.origin",
     }  # fmt: skip
 
 

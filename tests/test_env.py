@@ -64,11 +64,11 @@ def test_origin_is_where_the_first_step_shows_the_object():
     """On every packaged goal, in our environment and in Meta-World's own. A finger touches the
     drawer at drawer-close's start, so a step of 0.01 m moves it by up to a millimetre."""
     goals = np.concatenate([load_goal_set(name, TASKS) for name in ("train", "heldout")], 1)
-    env, task = Ml4Env(physics="native"), np.repeat(np.arange(len(TASKS)), goals.shape[1])
-    start = jax.vmap(env.reset_to)(task, goals.reshape(-1, 3).astype(np.float32))
+    env, task = Ml4Env(physics="native"), jnp.repeat(jnp.arange(len(TASKS)), goals.shape[1])
+    start = jax.vmap(env.reset_to)(task, jnp.asarray(goals.reshape(-1, 3), jnp.float32))
     origin = np.asarray(start.origin).reshape(goals.shape)
     for action in (np.zeros(4), np.array([1, 1, -1, 1]), np.array([-1, -1, 1, -1])):
-        after = jax.vmap(env.step)(start, np.tile(action.astype(np.float32), (len(task), 1)))
+        after = jax.vmap(env.step)(start, jnp.tile(jnp.float32(action), (len(task), 1)))
         shown = np.asarray(after.obs)[:, OBJECT].reshape(goals.shape)
         far = np.abs(shown - origin).max((1, 2))
         np.testing.assert_array_less(far, [1e-6, 1e-3, 1e-6, 1e-6])

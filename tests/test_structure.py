@@ -182,9 +182,8 @@ def test_mujoco_is_imported_in_one_place():
     """By `envs.engine`, for which no GL library need be there; metaworld and brax come after it."""
     guard = re.compile(r"\s*(import|from) envs\.(engine|quiet_mjx|mjx_physics)\b")
     foreign = re.compile(r"\s*(import|from) (mujoco|metaworld|brax)\b")
-    for name in (importers("mujoco") | importers("metaworld") | importers("brax")) - {
-        "envs.engine"
-    }:
+    users = importers("mujoco") | importers("metaworld") | importers("brax")
+    for name in users - {"envs.engine"}:
         lines = MODULES[name].read_text().splitlines()
         guards = [i for i, line in enumerate(lines) if guard.match(line)]
         late = [i for i, line in enumerate(lines) if foreign.match(line)]
