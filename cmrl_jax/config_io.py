@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import typing
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ import yaml
 from cmrl_jax.commands import quoted
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
 from cmrl_jax.validate import validate
+from cmrl_jax.yaml_tree import read_scalar, read_tree
+from envs.command_line import brief
 
 # What a resumed run may change: how long it trains, and what it reports. Not `eval.k`, by which
 # columns of metrics.csv are named.
@@ -188,58 +191,13 @@ def find_config(name: str | Path) -> Path:
 
 
 def read_yaml(path: Path) -> tuple[dict[str, Any], _Source]:
-    """Plain data of a YAML file and the line of each key."""
-    try:
-        node = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        cause = f"{path}:{line} is not valid YAML: {error.problem or error.context}"
-        raise ConfigError(cause, "check indentation, colons and quotes there") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not text that YAML can read", "save it as UTF-8") from error
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}", "check the file") from error
-    if node is None:
-        return {}, _Source(str(path))
-    if not isinstance(node, yaml.MappingNode):
-        raise ConfigError(f"{path} holds no mapping", "write it as `section:` and `key: value`")
-    lines: dict[str, int] = {}
-    return _plain(node, "", str(path), lines), _Source(str(path), lines)
+    """Plain data of a YAML file and the line of each key.
 
-
-def _plain(node: yaml.Node, dotted: str, name: str, lines: dict[str, int]) -> Any:
-    """Plain data of a YAML node; refuses what YAML would change or drop without a word."""
-    if isinstance(node, yaml.MappingNode):
-        out = {}
-        for key_node, value_node in node.value:
-            line = key_node.start_mark.line + 1
-            key = str(key_node.value)
-            child = f"{dotted}.{key}" if dotted else key
-            if key in out:
-                cause = f"key '{child}' stands twice ({name}:{lines[child]} and {name}:{line})"
-                raise ConfigError(cause, "keep one of the two")
-            lines[child] = line
-            out[key] = _plain(value_node, child, name, lines)
-        return out
-    if isinstance(node, yaml.SequenceNode):
-        return [_plain(item, dotted, name, lines) for item in node.value]
-    return _scalar(node, f" ({name}:{node.start_mark.line + 1})", dotted)
-
-
-def _scalar(node: yaml.Node, where: str, dotted: str) -> Any:
-    text, tag = str(node.value), node.tag.rpartition(":")[2]
-    digits = text.lstrip("+-")
-    if tag == "int" and (":" in text or (digits.startswith("0") and digits != "0")):
-        cause = f"YAML reads {text} as another number, for '{dotted}'{where}"
-        raise ConfigError(cause, "write a plain decimal number, without a leading 0 or a colon")
-    if tag == "float" and ":" in text:
-        cause = f"YAML reads {text} as another number, for '{dotted}'{where}"
-        raise ConfigError(cause, "write a plain decimal number, without a colon")
-    try:
-        return yaml.SafeLoader("").construct_object(node)
-    except (yaml.YAMLError, ValueError) as error:
-        cause = f"'{dotted}' has a value of a kind no key takes: {text}{where}"
-        raise ConfigError(cause, "write a number, true or false, or plain text") from error
+    Raises:
+        ConfigError: a file that cannot be read or is not YAML (`yaml_tree`).
+    """
+    data, lines = read_tree(path)
+    return data, _Source(str(path), lines)
 
 
 def _section(cls: type, data: Any, prefix: str, source: _Source) -> Any:
@@ -270,7 +228,7 @@ def _unknown(key: str, dotted: str, cls: type, where: str) -> None:
     if not near and elsewhere:
         near = f"did you mean '{elsewhere[0]}'? "
     cure = f"{near}valid: {', '.join(_names(cls))}"
-    raise ConfigError(f"unknown key '{dotted}'{where}", cure)
+    raise ConfigError(f"unknown key '{brief(dotted)}'{where}", cure)
 
 
 def _names(cls: type) -> list[str]:
@@ -289,29 +247,26 @@ def _replace(config: Config, dotted: str, text: str) -> Config:
 
 
 def parse_flag(text: str, hint: Any, dotted: str) -> Any:
-    """A flag's text as plain YAML data; `a,b` and `[a, b]` both make a list."""
+    """A flag's text as plain YAML data; `a,b` and `[a, b]` both make a list.
+
+    It is a word, not a document: anchors, aliases, tags, quotes and comments are text.
+    """
     where = f" (--{dotted})"
     if typing.get_origin(hint) is tuple:
-        inner = text.strip().removeprefix("[").removesuffix("]")
+        inner = text.strip()
+        if inner.startswith("[") != inner.endswith("]"):
+            cause = f"{dotted} has one bracket of two: {brief(text)}{where}"
+            raise ConfigError(cause, "write a,b or [a, b]")
+        inner = inner.removeprefix("[").removesuffix("]")
         items = [item.strip() for item in inner.split(",")] if inner.strip() else []
-        element = typing.get_args(hint)[0]
-        value: Any = [item if element is str else _flag_scalar(item, dotted) for item in items]
+        is_text = typing.get_args(hint)[0] is str
+        value: Any = items if is_text else [read_scalar(item, dotted, where) for item in items]
     elif hint is str or (typing.get_origin(hint) is Literal and text):
         value = text
     else:
-        value = _flag_scalar(text, dotted)
+        value = read_scalar(text.strip(), dotted, where)
     checked = _leaf(value, hint, dotted, where)
     return list(checked) if isinstance(checked, tuple) else checked
-
-
-def _flag_scalar(text: str, dotted: str) -> Any:
-    try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.YAMLError:
-        return text
-    if not isinstance(node, yaml.ScalarNode):
-        return text
-    return _scalar(node, f" (--{dotted})", dotted)
 
 
 def _leaf(value: Any, hint: Any, dotted: str, where: str) -> Any:
@@ -328,6 +283,9 @@ def _leaf(value: Any, hint: Any, dotted: str, where: str) -> Any:
     if value is None:
         cause = f"{dotted} has no value{where}"
         raise ConfigError(cause, f"give it {_KINDS[hint]}, or remove the key for its default")
+    if hint in (int, float) and type(value) is int and abs(value) >= 2**63:
+        cause = f"{dotted} is a number of {len(str(abs(value)))} digits{where}"
+        raise ConfigError(cause, "write a whole number below 2^63")
     if hint is float and type(value) is int:
         return float(value)
     if type(value) is not hint:
@@ -335,9 +293,15 @@ def _leaf(value: Any, hint: Any, dotted: str, where: str) -> Any:
         raise ConfigError(cause, _number_cure(value, hint) or f"write {_KINDS[hint]}")
     if hint is float and not math.isfinite(value):
         raise ConfigError(f"{dotted} is {value}{where}", "write a finite number")
+    if isinstance(value, str):
+        for letter in value:
+            if unicodedata.category(letter) in _NO_TEXT:
+                cause = f"{dotted} holds the control character {brief(letter)}{where}"
+                raise ConfigError(cause, "write plain text without it")
     return value
 
 
+_NO_TEXT = ("Cc", "Cs", "Zl", "Zp")  # control, half a character, line and paragraph separators
 _KINDS = {
     int: "a whole number",
     float: "a number",
@@ -362,18 +326,19 @@ def _number_cure(value: Any, hint: type) -> str:
         return ""
     try:
         number = float(value)
+        exponent = int(str(value).strip().lower().partition("e")[2] or 0)
     except ValueError:
         return ""
-    if not math.isfinite(number):
+    if not math.isfinite(number) or (hint is int and abs(number) >= 2**63):
         return ""
     if hint is int:
         return f"write {int(number)}" if number == int(number) else "write a whole number"
-    mantissa, e, exponent = str(value).strip().lower().partition("e")
+    mantissa, e, _ = str(value).strip().lower().partition("e")
     if not e:
         return f"write {number} without quotes"
     mantissa = mantissa if "." in mantissa else f"{mantissa}.0"
     mantissa = f"{mantissa}0" if mantissa.endswith(".") else mantissa
-    return f"write {mantissa}e{int(exponent):+d}"
+    return f"write {mantissa}e{exponent:+d}"
 
 
 def _show(value: Any) -> str:
@@ -382,12 +347,12 @@ def _show(value: Any) -> str:
     if isinstance(value, Mapping):
         return "a section"
     if isinstance(value, str):
-        return f"the text '{value}'"
-    return str(list(value)) if isinstance(value, tuple) else str(value)
+        return f"the text '{brief(value)}'"
+    return brief(str(list(value) if isinstance(value, tuple) else value))
 
 
 def _bare(value: Any) -> str:
-    return value if isinstance(value, str) else _show(value)
+    return brief(value) if isinstance(value, str) else _show(value)
 
 
 def _flat(data: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

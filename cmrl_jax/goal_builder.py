@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from cmrl_jax.config import TEXT_ENCODERS, ConfigError, call_envs
 from cmrl_jax.encoders import Encoder, file_sha256, find_encoder
 from cmrl_jax.flags import writable
 from cmrl_jax.goal_files import PROMPTS_FILE, table_path
 from cmrl_jax.goals import GoalTable, read_table
+from cmrl_jax.yaml_tree import read_tree
 from envs.outputs import replacing
 
 
@@ -28,11 +28,8 @@ def read_prompts(path: Path = PROMPTS_FILE) -> dict[str, dict[str, list[str]]]:
         ConfigError: unreadable file, or not equally many distinct sentences for every task.
     """
     cure = f"give every task in {path} equally many train and heldout sentences, none twice"
-    try:
-        prompts = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"the prompts cannot be read: {error}", cure) from None
-    if not isinstance(prompts, dict) or not prompts:
+    prompts, _ = read_tree(path)
+    if not prompts:
         raise ConfigError(f"{path} names no tasks", cure)
     counts = set()
     for task, kinds in prompts.items():

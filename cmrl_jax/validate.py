@@ -23,6 +23,8 @@ from cmrl_jax.config import (
 from envs.command_line import LARGEST
 from envs.goal_names import seed_of
 
+MAX_INT = 2**31 - 1  # jax counts and indexes in 32 bits; `high` of a field that may be larger
+
 # Options of the schema whose code is not there yet: refused by name, so that nobody trains for an
 # hour on a switch that does nothing.
 NOT_BUILT = {
@@ -65,6 +67,8 @@ def _check_bounds(config: Config) -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, bool | str):
                 continue
+            if high is None and isinstance(number, int):
+                high = MAX_INT
             lower = f"above {above}" if above is not None else f"at least {low}"
             inside = number > above if above is not None else number >= low
             if high is None and isinstance(number, int):
@@ -143,8 +147,8 @@ def _check_sizes(config: Config) -> None:
         cure = "raise collect.lanes, or set the smallest share of collect.group_frac to 0"
         _require(not starved, cause, cure)
     cause = f"env.horizon {horizon} is not a multiple of collect.chunk {collect.chunk}"
-    divisors = [c for c in range(1, collect.chunk + 1) if horizon % c == 0]
-    _require(horizon % collect.chunk == 0, cause, f"set collect.chunk: {divisors[-1]}")
+    cure = f"set collect.chunk: {_divisor(horizon, collect.chunk)}"
+    _require(horizon % collect.chunk == 0, cause, cure)
     cause = f"sac.n_step {config.sac.n_step} is longer than env.horizon {horizon}"
     _require(config.sac.n_step <= horizon, cause, f"set sac.n_step to at most {horizon}")
     capacity = config.train.capacity
@@ -163,6 +167,12 @@ def _check_sizes(config: Config) -> None:
     _require(capacity % lanes == 0, cause, f"set train.capacity: {-(-capacity // lanes) * lanes}")
     cause = "train.env_steps and train.minutes are both 0: the run would never end"
     _require(bool(config.train.env_steps or config.train.minutes), cause, "set one of them")
+
+
+def _divisor(number: int, most: int) -> int:
+    """The largest divisor of a number that is not above `most`."""
+    small = [d for d in range(1, math.isqrt(number) + 1) if number % d == 0]
+    return max(d for low in small for d in (low, number // low) if d <= most)
 
 
 def check_goal_table(table: str) -> None:

@@ -45,8 +45,7 @@ def run(command: Callable[[], None]) -> int:
 
 def brief(text: str | Path) -> str:
     """What a user typed, on one line, printable and not longer than can be read."""
-    text = str(text)
-    text = text if text.isprintable() else repr(text)
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text))
     return text if len(text) <= 100 else f"{text[:60]} ... {text[-20:]} ({len(text)} letters)"
 
 

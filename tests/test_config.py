@@ -41,7 +41,7 @@ TRAPS = [
     ("seed: 1:30.5", "YAML reads 1:30.5 as another number", "colon"),
     ("seed:", "seed has no value", "default"),
     ("seed: 2026-01-01", "got 2026-01-01", "whole number"),
-    ("seed: !!python/name:os.getcwd", "a kind no key takes", "plain text"),
+    ("seed: !!python/name:os.getcwd", "a kind no key takes", "remove it"),
     ("name: 3", "name needs text", "text"),
     ("seed: 1\nname: x\nseed: 2", "'seed' stands twice", "keep one"),
     ("sac: {lr: 0.1}\nsac: {tau: 0.1}", "'sac' stands twice", "keep one"),

@@ -23,6 +23,7 @@ LIGHT = {
     "config",
     "validate",
     "config_io",
+    "yaml_tree",
     "run_dir",
     "documents",
     "run_files",
@@ -83,7 +84,7 @@ ROWS = (
     },
     {"goal_files", "pca", "run_files", "old_statistics"},
     {"manifest", "named_arrays", "parallel", "moments", "locks", "documents"},
-    {"validate"},
+    {"validate", "yaml_tree"},
     {"config", "commands"},
 )
 

@@ -192,7 +192,7 @@ def test_a_goal_table_that_leads_nowhere_is_refused(refused, here, table):
 
 def test_a_goal_table_with_a_nul_in_its_yaml(refused, here):
     (here / "c.yaml").write_text('goals: {table: "a\\0b.npz"}')
-    assert r"'a\x00b.npz'" in refused("--config", "c.yaml")[0]
+    assert r"\x00" in refused("--config", "c.yaml")[0]
 
 
 def test_a_folder_that_may_not_be_searched_is_said(monkeypatch):
