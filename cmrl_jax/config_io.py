@@ -112,7 +112,7 @@ def changed_fields(saved: Mapping[str, Any], config: Config) -> list[tuple[str, 
             lacks was added later and counts as what such a run was made with.
         config: the config to go on with.
     """
-    old = _recorded(saved)
+    old = recorded(saved)
     changed = []
     for dotted, f, new in leaves(config):
         before = old.pop(dotted, f.default)
@@ -136,7 +136,7 @@ def check_resumable(saved: Mapping[str, Any], config: Config, run: Path) -> None
         )
 
 
-def _recorded(saved: Mapping[str, Any]) -> dict[str, Any]:
+def recorded(saved: Mapping[str, Any]) -> dict[str, Any]:
     """A run's config by dotted name. A key it lacks had its default, but for one: `canonical` runs
     once took their origin from the reset observation, which need not show where the object is."""
     record = dict(_flat(saved))
@@ -147,7 +147,7 @@ def _recorded(saved: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_origin(saved: Mapping[str, Any], run: Path) -> None:
     """Raises ConfigError if a run's policy saw another origin; `saved` as in `changed_fields`."""
-    old, new = _recorded(saved).get("env.origin"), Config().env.origin
+    old, new = recorded(saved).get("env.origin"), Config().env.origin
     if old not in (None, new):
         raise ConfigError(
             f"{run} saw canonical observations from another origin: env.origin: {old} -> {new}",

@@ -33,7 +33,7 @@ def drawn(monkeypatch):
     """
     panels = {}
 
-    def spy(pyplot, figure, axes, out):
+    def spy(pyplot, figure, axes, out, *_):
         pyplot.close(figure)
         panels.clear()
         for axis in axes:
@@ -147,6 +147,19 @@ def test_different_runs_of_one_name_are_two_curves(tmp_path, drawn):
     plots.plot_bars(Runs(runs), tmp_path / "b.png")
     heights = [drawn[""][f"run, env.horizon {n}, k = 0 (filled: last step)"] for n in (50, 200)]
     assert heights == [[0.2], [0.6]]
+
+
+def test_runs_from_before_the_origin_was_recorded_are_no_seeds_of_runs_of_today(tmp_path):
+    """Their config.yaml does not name it; today's default is not what they were made with."""
+    seeds = [seed_of(tmp_path, n, flags={"env.obs_mode": "canonical"}) for n in (0, 1, 2)]
+    for old in seeds[:2]:
+        config = (old / "config.yaml").read_text()
+        assert ", origin: settled" in config
+        (old / "config.yaml").write_text(config.replace(", origin: settled", ""))
+    assert Runs(seeds).groups == {
+        "soft, env.origin reset observation": seeds[:2],
+        "soft, env.origin settled": seeds[2:],
+    }
 
 
 def test_a_run_under_two_names_is_not_two_seeds(tmp_path, drawn, refused):
