@@ -52,6 +52,7 @@ def _evaluate(
     run: Path, options: EvalOptions, checkpoint: int | None
 ) -> tuple[dict[str, Any], list[Row]]:
     """Scores a policy in one of our backends: the result as JSON has it, and the cells."""
+    assert options.physics != "metaworld"  # the caller has looked
     config = evaluation_config(run, options.physics)
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)

@@ -292,8 +292,13 @@ class FineTuning:
 
 def mean_score(scores: Episode) -> Score:
     """Means over all lanes."""
-    figures = (scores.success_any, scores.success_last, scores.returns, scores.faults)
-    return Score(*(float(np.mean(figure)) for figure in figures))
+    mean = lambda figure: float(np.mean(figure))
+    return Score(
+        success_any=mean(scores.success_any),
+        success_last=mean(scores.success_last),
+        returns=mean(scores.returns),
+        faults=mean(scores.faults),
+    )
 
 
 def own_belief(learner: Learner, state: TrainState, ring: ReplayState, text: jax.Array) -> Belief:

@@ -4,6 +4,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,11 +106,15 @@ def changed(config, name):
     owner = config
     for section in sections:
         owner = getattr(owner, section)
-    old = getattr(owner, key)
-    new = CHANGED.get(name)
-    if new is None:
-        new = not old if isinstance(old, bool) else f"{old}x" if isinstance(old, str) else None
-        new = new if new is not None else (*old, 1) if isinstance(old, tuple) else old + 1
+    old: Any = getattr(owner, key)
+    if name in CHANGED:
+        new = CHANGED[name]
+    elif isinstance(old, bool):
+        new = not old
+    elif isinstance(old, str):
+        new = f"{old}x"
+    else:
+        new = (*old, 1) if isinstance(old, tuple) else old + 1
     assert new != old, name
     owner = replace(owner, **{key: new})
     return replace(config, **{sections[0]: owner}) if sections else owner
