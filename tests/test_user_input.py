@@ -8,6 +8,7 @@ import argparse
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,7 +16,7 @@ from cmrl_jax import cli, evaluate_flags, finetune_flags, goals_cli, plot_flags,
 from cmrl_jax.cli import main
 from cmrl_jax.config import Config, ConfigError, leaves
 from cmrl_jax.config_io import load_config, to_yaml
-from envs import goal_sets, parity, picture
+from envs import command_line, goal_sets, parity, picture
 from envs.command_line import Parser, typed_path, what_is
 from envs.outputs import check_output
 
@@ -199,7 +200,7 @@ def test_a_folder_that_may_not_be_searched_is_said(monkeypatch):
     def denied(path):
         raise PermissionError(13, "Permission denied", path)
 
-    monkeypatch.setattr(os, "stat", denied)
+    monkeypatch.setattr(command_line, "os", SimpleNamespace(stat=denied))
     with pytest.raises(ValueError, match="secret/run cannot be followed: Permission denied\n"):
         what_is("secret/run")
     with pytest.raises(argparse.ArgumentTypeError, match="folders that you may search"):
