@@ -11,7 +11,7 @@ import math
 import typing
 import unicodedata
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -156,18 +156,17 @@ def check_origin(saved: Mapping[str, Any], run: Path) -> None:
 
 
 def run_config(run: Path, acts: bool = True) -> Config:
-    """The configuration of a run, from its own config.yaml.
-
-    Args:
-        acts: whether its policy is to act, so that it must see what it learned by.
+    """The configuration that a run was made with, from its own config.yaml.
 
     Raises:
-        ConfigError: it cannot be read, or the policy would see something else.
+        ConfigError: it cannot be read; or its policy, if it `acts`, would see other observations.
     """
     data, source = read_yaml(run / "config.yaml")
     if acts:
         check_origin(data, run)
-    return resolve(data, source)
+    config = resolve(data, source)
+    origin = _recorded(data).get("env.origin", config.env.origin)
+    return replace(config, env=replace(config.env, origin=origin))
 
 
 def config_dirs() -> list[Path]:

@@ -55,12 +55,18 @@ def command(name: str, control: str) -> list[str]:
     return [*words, *shlex.split(CONTROLS[control]), "--json", str(kept)]
 
 
+def label(run: Path) -> str:
+    """A run's name in a table; marked where its policy saw what no policy is shown any more."""
+    origin = run_config(run, acts=False).env.origin
+    return run.name if origin == Config().env.origin else f"{run.name} (old origin)"
+
+
 def table(run: Path) -> list[str]:
     """Success at any step of every control, a row a control and a column a task; k side by side."""
     kept = {name: kept_file(run, name) for name in CONTROLS}
     found = {name: read_evaluation(path).tasks for name, path in kept.items() if path.is_file()}
     tasks = list(found["posterior"])
-    head = [f"{run.name}, k = {K.replace(',', ', ')}", *tasks]
+    head = [f"{label(run)}, k = {K.replace(',', ', ')}", *tasks]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for name, by_task in found.items():
         cells = []

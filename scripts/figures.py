@@ -85,7 +85,9 @@ def table(runs: list[Path]) -> list[str]:
         counts = [f"{last(name):,.0f}" for name in ("env_steps", "gradient_steps")]
         wall = f"{last('wall_s') / 60:.1f}"
         solved = steps_to_solve(rows, config.tasks.train, max(config.eval.k))
-        lines.append("| " + " | ".join([run.name, *counts, wall, solved, str(k), *cells]) + " |")
+        lines.append(
+            "| " + " | ".join([controls.label(run), *counts, wall, solved, str(k), *cells]) + " |"
+        )
     return lines
 
 

@@ -1,5 +1,7 @@
 """A run's own config.yaml: what it says of a run that is older than one of its keys."""
 
+import dataclasses
+
 import pytest
 import yaml
 
@@ -13,6 +15,7 @@ from cmrl_jax.config_io import (
     to_dict,
     to_yaml,
 )
+from cmrl_jax.run_groups import group_runs, settings_of
 
 
 def make_old_run(run, obs_mode):
@@ -58,9 +61,20 @@ def test_metaworlds_observations_have_no_origin(tmp_path):
     check_resumable(saved, config, tmp_path)
 
 
-def test_figures_of_an_older_origin_are_still_read(tmp_path):
-    config = make_old_run(tmp_path, "canonical")
-    assert run_config(tmp_path, acts=False) == config
+def test_figures_of_an_older_origin_are_still_read_as_those_of_another_run(tmp_path):
+    """A mean over seeds must not mix the two."""
+    runs = [tmp_path / "x-seed0", tmp_path / "x-seed1"]
+    config = make_old_run(runs[0], "canonical")
+    runs[1].mkdir()
+    (runs[1] / "config.yaml").write_text(to_yaml(dataclasses.replace(config, seed=1)))
+    read = {run: run_config(run, acts=False) for run in runs}
+    changed = dict(settings_of(read[runs[0]]).items() - settings_of(config).items())
+    assert changed == {"env.origin": "reset observation"}
+    groups = group_runs({run: settings_of(found) for run, found in read.items()})
+    assert groups == {
+        "x, env.origin reset observation": [runs[0]],
+        "x, env.origin settled": [runs[1]],
+    }
 
 
 def test_an_older_record_is_a_config_for_new_runs(tmp_path):
