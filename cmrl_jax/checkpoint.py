@@ -25,6 +25,7 @@ from cmrl_jax.config_io import check_origin, check_resumable
 from cmrl_jax.manifest import find_damage, fingerprint, is_listed, write_manifest
 from cmrl_jax.named_arrays import describe, flatten, not_finite, placed, unflatten
 from cmrl_jax.old_statistics import as_stored, brought_up
+from cmrl_jax.streams import to_stderr
 
 FULL_ITEMS = ("learner", "replay", "context")
 POLICY_ITEMS = ("policy",)
@@ -205,7 +206,7 @@ class CheckpointStore:
             for damaged_step, error in bad:
                 kept = self._set_aside(damaged_step)
                 tail = f"; kept as {kept}, going on from {step}"
-                print(f"warning: {error.cause}{tail}", file=sys.stderr)
+                to_stderr(f"warning: {error.cause}{tail}")
             if not is_listed(self.directory / str(step)):
                 write_manifest(self.directory / str(step))
             self._prune()  # what a kill left of a step that was being deleted
@@ -348,7 +349,7 @@ def _warn_of_versions(path: Path, saved: Mapping[str, Any], here: Mapping[str, A
     names = sorted(name for name in saved.keys() | here.keys() if saved.get(name) != here.get(name))
     if names:
         shown = ", ".join(f"{n} {saved.get(n)} (here {here.get(n)})" for n in names)
-        print(f"warning: {path} was written with {shown}", file=sys.stderr)
+        to_stderr(f"warning: {path} was written with {shown}")
 
 
 def _hush_orbax() -> None:

@@ -8,14 +8,16 @@ other exception keeps its traceback. jax and mujoco are imported by the commands
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
+import signal
 import sys
 import typing
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from cmrl_jax import evaluate_flags, finetune_flags, plot_flags, render_flags
+from cmrl_jax import evaluate_flags, finetune_flags, plot_flags, render_flags, streams
 from cmrl_jax.commands import program
 from cmrl_jax.config import Config, ConfigError, call_envs, leaves, suggest
 from cmrl_jax.config_io import (
@@ -31,14 +33,16 @@ from cmrl_jax.config_io import (
 from cmrl_jax.flags import Parser, add_force, distinct, names, parse, parser_of, shown, writable
 from cmrl_jax.goal_files import find_table
 from cmrl_jax.run_dir import (
+    check_unused,
     config_stem,
     find_run,
+    forget_unbegun,
     new_run,
     resumed_run,
     write_text,
     writing_to,
 )
-from cmrl_jax.stop import StopSignal
+from cmrl_jax.stop import StopSignal, is_interrupt
 from envs.command_line import typed_path
 from envs.outputs import written_by
 
@@ -48,12 +52,48 @@ COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "go
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
+    streams.open_streams()
+    output: Any = streams.Output(sys.stdout)
+    with contextlib.redirect_stdout(output):
+        try:
+            code = _outcome(words)
+            failed = streams.failure(output)
+        except (OSError, SystemExit):  # a failed print; `--help`, whose failed print argparse hides
+            code, failed = 0, streams.failure(output) or output.error
+            if failed is None:
+                raise
+    return streams.exit_code(failed) if failed and not code else code
+
+
+def _outcome(words: list[str]) -> int:
+    """The exit code of a command, after two lines where its user can mend what stopped it."""
     try:
         return _dispatch(words)
     except ConfigError as error:
-        for label, text in (("error", error.cause), ("fix", error.cure)):
-            print(f"{label}: {' '.join(text.split())}", file=sys.stderr)
-        return 2
+        return _refuse(error.cause, error.cure)
+    except ValueError as error:
+        if _raised_in(error) != "jax._src.config":
+            raise
+        return _refuse(f"jax does not start: {error}", "correct that variable, or unset it")
+    except (KeyboardInterrupt, RuntimeError) as error:
+        if not is_interrupt(error):
+            raise
+        return 128 + signal.SIGINT
+
+
+def _refuse(cause: str, cure: str) -> int:
+    """Says what is wrong and what to do; returns the exit code."""
+    lines = (("error", cause), ("fix", cure))
+    streams.to_stderr(*(f"{label}: {' '.join(text.split())}" for label, text in lines))
+    return 2
+
+
+def _raised_in(error: BaseException) -> str:
+    """Name of the module whose code raised an error."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return "" if trace is None else trace.tb_frame.f_globals.get("__name__", "")
 
 
 def _dispatch(words: list[str]) -> int:
@@ -135,12 +175,18 @@ def _train(words: list[str]) -> int:
     else:
         run = new_run(config_stem(path), run)
     with writing_to(run):
+        if not resume:
+            check_unused(run)  # once more: another process may have come and gone
         write_text(run / "config.yaml", to_yaml(config))  # from here on it can be resumed
         stop = StopSignal()  # before the imports that take seconds
         try:
             from cmrl_jax import trainer
 
             return trainer.train(config=config, run_dir=run, stop=stop, resume=resume)
+        except ValueError:  # a ConfigError is one
+            if not resume:
+                forget_unbegun(run)
+            raise
         finally:
             stop.restore()
 

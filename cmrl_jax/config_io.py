@@ -165,7 +165,7 @@ def run_config(run: Path, acts: bool = True) -> Config:
     if acts:
         check_origin(data, run)
     config = resolve(data, source)
-    origin = _recorded(data).get("env.origin", config.env.origin)
+    origin = recorded(data).get("env.origin", config.env.origin)
     return replace(config, env=replace(config.env, origin=origin))
 
 

@@ -12,7 +12,7 @@ evaluation of a process runs one compiled program, controls included.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -112,28 +112,39 @@ class Evaluator:
         return 0 if stats is None else stats.temp_size_in_bytes + stats.output_size_in_bytes
 
     def run(
-        self, policies: Sequence[PolicyParams], trial: Trial, k: Sequence[int], seed: int
+        self,
+        policies: Sequence[PolicyParams],
+        trial: Trial,
+        k: Sequence[int],
+        seed: int,
+        check: Callable[[], None] = lambda: None,
     ) -> dict[int, Episode]:
-        """Scores at every k of `k`; arguments as of `episodes`.
+        """Scores at every k of `k`; other arguments as of `episodes`.
 
         Returns:
             k -> Episode of numpy arrays (policy, task, goal, draw). Its faults are those of the
             adaptation episodes, too.
         """
         scores, faults = [], 0
-        for _, score in self.episodes(policies, trial, max(k) + 1, seed):
+        for _, score in self.episodes(policies, trial, max(k) + 1, seed, check):
             faults = faults + score.faults
             scores.append(score._replace(faults=faults))
         return {n: scores[n] for n in k}
 
     def episodes(
-        self, policies: Sequence[PolicyParams], trial: Trial, count: int, seed: int
+        self,
+        policies: Sequence[PolicyParams],
+        trial: Trial,
+        count: int,
+        seed: int,
+        check: Callable[[], None] = lambda: None,
     ) -> Iterator[tuple[Any, Episode]]:
         """Plays `count` episodes of every adaptation run, each from what those before it showed.
 
         Args:
             policies: at most as many as the evaluator has place for.
             seed: seed of the draws; a draw depends on it, task, goal, draw and episode alone.
+            check: is called before each batch; what it raises ends the evaluation.
 
         Yields:
             For each episode the beliefs of all lanes before it, numpy (policy, lane, ...) or None
@@ -153,6 +164,7 @@ class Evaluator:
             before = jax.tree.map(np.copy, beliefs)
             parts = []
             for start in range(0, total, self.lanes):
+                check()
                 index = np.minimum(np.arange(start, start + self.lanes), total - 1)
                 giver = donor[index]
                 belief = jax.tree.map(lambda x: x[:, giver], before) if uses_belief else None

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import sys
 from typing import IO, Any
+
+from cmrl_jax.streams import to_stderr
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
 
@@ -27,8 +28,7 @@ def lock(file: IO[Any], what: str) -> None:
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
-        print(
+        to_stderr(
             f"warning: {what} is on a file system without locks ({error.strerror}): "
-            "take care that no other process writes to it",
-            file=sys.stderr,
+            "take care that no other process writes to it"
         )

@@ -6,6 +6,7 @@ files byte for byte; what is not a function of config and seed is named `wall_s`
 
 from __future__ import annotations
 
+import csv
 import datetime
 import importlib.metadata
 import json
@@ -14,7 +15,8 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -23,6 +25,7 @@ import numpy as np
 
 from cmrl_jax.config import ConfigError
 from cmrl_jax.run_dir import write_text
+from cmrl_jax.streams import Output
 
 LEADING_COLUMNS = ("iteration", "env_steps", "gradient_steps", "wall_s", "seed")
 PACKAGES = (
@@ -105,6 +108,12 @@ class MetricsCsv:
         self._write((",".join(format_figure(row.get(c)) for c in self.columns) + "\n").encode())
         self.offset = self._file.tell()
 
+    def rows(self) -> Iterator[dict[str, float | None]]:
+        """The rows so far, oldest first; None where a figure was not taken."""
+        with open(self._file.name, encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                yield {name: float(text) if text else None for name, text in row.items()}
+
     def _write(self, line: bytes) -> None:
         self._file.write(line)
         self._file.flush()  # a killed run keeps every row that it reported
@@ -133,29 +142,61 @@ def _check_resumable(path: Path, header: bytes, offset: int) -> None:
 
 
 class TensorBoard:
-    """TensorBoard events over env steps, for `log.tensorboard`."""
+    """TensorBoard events over env steps, for `log.tensorboard`: the rows of metrics.csv once more.
 
-    def __init__(self, directory: Path, resume_at: int | None = None):
-        """Open an event file in `directory`; events after env step `resume_at` are superseded.
+    An event file begins with all rows so far and takes the place of the one before, so that it
+    holds what metrics.csv holds, whatever a kill or a resume has cut there. Records are written by
+    this thread: tensorboardX's own writer queues them, and a killed process loses its queue.
+    """
+
+    def __init__(self, directory: Path, rows: Iterable[Row] = (), begun: float | None = None):
+        """Start an event file in `directory`.
+
+        Args:
+            rows: those of metrics.csv so far.
+            begun: clock time (s) from which the rows' `wall_s` counts; now by default.
 
         Raises:
             ConfigError: tensorboardX is not installed.
         """
         try:
-            from tensorboardX import SummaryWriter
+            from tensorboardX import RecordWriter
+            from tensorboardX.proto import event_pb2
         except ImportError as error:
             raise ConfigError(
                 "log.tensorboard needs the package tensorboardX, which is not installed",
                 "pip install tensorboardX, or set log.tensorboard to false",
             ) from error
-        self._writer = SummaryWriter(str(directory), purge_step=resume_at)
+        events: Any = event_pb2  # made at run time, so that no type checker knows what is in it
+        self._event, self._begun = events.Event, time.time() if begun is None else begun
+        directory.mkdir(parents=True, exist_ok=True)
+        before = list(directory.glob("events.*"))
+        # TensorBoard reads the files of a directory in the order of their names.
+        self._writer = RecordWriter(str(directory / f"events.out.tfevents.{time.time_ns()}"))
+        self._add(self._event(file_version="brain.Event:2", wall_time=self._begun))
+        # One that looks on drops what it has read of the files before.
+        start = events.SessionLog(status=events.SessionLog.START)
+        self._add(self._event(session_log=start, wall_time=self._begun))
+        for row in rows:
+            self._add_row(row)
+        self._writer.flush()
+        for path in before:
+            os.truncate(path, 0)  # a TensorBoard that looks on would not go past one that is gone
 
     def write(self, row: Row) -> None:
         """Add every figure of a row, except the leading columns."""
+        self._add_row(row)
+        self._writer.flush()
+
+    def _add_row(self, row: Row) -> None:
+        event = self._event(step=int(row["env_steps"]), wall_time=self._begun + row["wall_s"])
         for name, value in row.items():
             if name not in LEADING_COLUMNS and value is not None:
-                self._writer.add_scalar(name, float(value), int(row["env_steps"]))
-        self._writer.flush()
+                event.summary.value.add(tag=name, simple_value=float(value))
+        self._add(event)
+
+    def _add(self, event: Any) -> None:
+        self._writer.write(event.SerializeToString())
 
     def close(self) -> None:
         self._writer.close()
@@ -226,20 +267,35 @@ def format_evaluation(row: Row) -> str | None:
 
 
 class Console:
-    """Lines on a stream, above a progress bar where the stream is a terminal."""
+    """Lines on a stream, above a progress bar where the stream is a terminal.
 
-    def __init__(self, progress: bool = True, stream: TextIO | None = None):
-        self._stream = stream or sys.stdout
+    A stream that can no longer be written raises nothing here: `error` says why, later lines are
+    lost, and `on_error` is called once.
+    """
+
+    def __init__(
+        self,
+        progress: bool = True,
+        stream: TextIO | None = None,
+        on_error: Callable[[], None] = lambda: None,
+    ):
+        self._stream = Output(stream or sys.stdout, on_error)
         self._progress = None
         if progress and self._stream.isatty():
             from rich.console import Console as RichConsole
             from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
             columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
-            console = RichConsole(file=self._stream, highlight=False, markup=False)
+            file: Any = self._stream
+            console = RichConsole(file=file, highlight=False, markup=False)
             self._progress = Progress(*columns, console=console, transient=True)
             self._bar = self._progress.add_task("training", total=1.0)
             self._progress.start()
+
+    @property
+    def error(self) -> OSError | None:
+        """What keeps the stream from being written."""
+        return self._stream.error
 
     def line(self, text: str) -> None:
         """Print one line."""

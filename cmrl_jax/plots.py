@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from cmrl_jax.config import Config, ConfigError, as_config_error
-from cmrl_jax.config_io import read_yaml, recorded, run_config
+from cmrl_jax.config_io import run_config
 from cmrl_jax.flags import writable
 from cmrl_jax.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.inspection_file import read_inspection
@@ -83,7 +83,7 @@ class Runs:
         self.configs: dict[Path, Config] = {run: run_config(run, acts=False) for run in runs}
         found = {run: final_evaluation(run, self.rows[run]) for run in runs}
         self.evaluations = {run: e for run, e in found.items() if e is not None}
-        self.groups = group_runs({run: _made_with(run, c) for run, c in self.configs.items()})
+        self.groups = group_runs({run: settings_of(c) for run, c in self.configs.items()})
         for group in self.groups.values():
             _check_alike({run: self.evaluations[run] for run in group if run in self.evaluations})
         self.tasks: list[str] = []
@@ -121,13 +121,6 @@ class Runs:
         found = [e.tasks[task] for e in evaluations if task in e.tasks]
         shared = [k for k in found[0] if all(k in curve for curve in found)] if found else []
         return [{k: curve[k] for k in shared} for curve in found] if shared else []
-
-
-def _made_with(run: Path, config: Config) -> dict[str, Any]:
-    """A run's settings; of those that its config.yaml is too old to name, what they were then."""
-    settings = settings_of(config)
-    old = recorded(read_yaml(run / "config.yaml")[0])
-    return settings | {"env.origin": old.get("env.origin", settings["env.origin"])}
 
 
 def _check_alike(evaluations: Mapping[Path, Evaluation]) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import datetime
 import errno
-import fcntl
 import os
 import re
 import socket
@@ -18,6 +17,7 @@ from pathlib import Path
 
 from cmrl_jax.commands import command, quoted
 from cmrl_jax.config import ConfigError, call_envs
+from cmrl_jax.locks import lock
 from envs.command_line import brief, what_is
 
 RUN_FILES = ("config.yaml", "metrics.csv", "ckpt")
@@ -94,20 +94,50 @@ def new_run(stem: str, run: Path | None, now: datetime.datetime | None = None) -
     Raises:
         ConfigError: where it holds a run already, or cannot be made.
     """
-    if run is None:
-        time = (now or datetime.datetime.now()).strftime("%Y%m%d-%H%M%S")
-        base = ROOT / f"{stem}-{time}"
-        run, copy = base, 1
-        while run.exists():
-            run, copy = base.with_name(f"{base.name}-{copy}"), copy + 1
-    elif call_envs(lambda: what_is(run / RUN_FILES[0])) and holds_run(run):
+    try:
+        if run is None:
+            time = (now or datetime.datetime.now()).strftime("%Y%m%d-%H%M%S")
+            run = ROOT / f"{stem}-{time}"
+            return _made(run)
+        check_unused(run)
+        run.mkdir(parents=True, exist_ok=True)
+        return run
+    except OSError as error:
+        assert run is not None
+        raise cannot_write(run, error) from error
+
+
+def _made(base: Path) -> Path:
+    """A directory that was not there before: `base`, or `base-<n>`.
+
+    Who makes it has it, so that of many starts in one second each gets its own.
+    """
+    base.parent.mkdir(parents=True, exist_ok=True)
+    run, copy = base, 0
+    while True:
+        try:
+            run.mkdir()
+            return run
+        except FileExistsError:
+            copy += 1
+            run = base.with_name(f"{base.name}-{copy}")
+
+
+def check_unused(run: Path) -> None:
+    """Raises ConfigError where a directory holds a run already."""
+    call_envs(lambda: what_is(run / RUN_FILES[0]))
+    if holds_run(run):
         cause = f"run directory {run} already holds a run"
         raise ConfigError(cause, "add --resume to go on with it, or give another --run DIR")
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(run, error) from error
-    return run
+
+
+def forget_unbegun(run: Path) -> None:
+    """Takes `config.yaml` back from a run that was refused before it wrote anything else.
+
+    So the same command can be given again, once what it was refused for is mended.
+    """
+    if not any((run / name).exists() for name in RUN_FILES if name != "config.yaml"):
+        (run / "config.yaml").unlink(missing_ok=True)
 
 
 def cannot_write(run: Path, error: OSError) -> ConfigError:
@@ -129,7 +159,7 @@ def writing_to(run: Path) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         try:
             file = stack.enter_context(open(run / LOCK, "a+", encoding="utf-8"))
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(file, f"run directory {run}")
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}")
             file.flush()

@@ -21,6 +21,7 @@ from cmrl_jax.controls import text_per_goal
 from cmrl_jax.episode import PolicyParams
 from cmrl_jax.evaluate import Evaluator, Trial
 from cmrl_jax.goals import GoalTable, load_goals
+from cmrl_jax.jax_runtime import cache_directory, check_switches, first_device
 from cmrl_jax.learner import Learner, TrainState, make_learner
 from cmrl_jax.metrics import package_versions
 from envs.goal_sets import load_goal_set
@@ -32,15 +33,19 @@ def prepare_jax(config: Config) -> str:
 
     An environment that already names a compilation cache (JAX_COMPILATION_CACHE_DIR) keeps it, and
     its own precision (JAX_DEFAULT_MATMUL_PRECISION) is the default one.
+
+    Raises:
+        ConfigError: jax is set to what this program cannot work with, or finds no device.
     """
+    check_switches()
     default = os.environ.get("JAX_DEFAULT_MATMUL_PRECISION")
     highest = config.runtime.matmul_precision == "highest"
     jax.config.update("jax_default_matmul_precision", "highest" if highest else default)
     cache = config.runtime.compile_cache
     if cache and not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        jax.config.update("jax_compilation_cache_dir", str(Path(cache).expanduser()))
+        jax.config.update("jax_compilation_cache_dir", cache_directory(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-    device = jax.devices()[0]
+    device = first_device()
     return f"{device.platform} ({device.device_kind}), {jax.device_count()} device(s)"
 
 

@@ -25,6 +25,7 @@ from cmrl_jax.metrics import format_duration
 from cmrl_jax.scores import cell_rows, fault_warning, of_policy, summarise_rows
 from cmrl_jax.session import Policy, Session, prepare_jax
 from cmrl_jax.settings import result_fields, row_columns
+from cmrl_jax.stop import is_interrupt
 from cmrl_jax.targets import (
     Target,
     cells_per_task,
@@ -113,11 +114,6 @@ def sweep(
         }
         call_envs(lambda: write_json(json_path, "sweep", result))
     return 0
-
-
-def is_interrupt(error: BaseException) -> bool:
-    """Whether Ctrl-C is behind an error: in a host callback, as MuJoCo C has, jax wraps it."""
-    return isinstance(error, KeyboardInterrupt) or KeyboardInterrupt.__name__ in str(error)
 
 
 def evaluate_group(

@@ -44,6 +44,7 @@ from cmrl_jax.run_dir import write_text
 from cmrl_jax.scores import fault_warning, format_scores, of_policy, summarise
 from cmrl_jax.session import Session, policy_params, prepare_jax
 from cmrl_jax.stop import StopSignal
+from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
 from cmrl_jax.validate import check_devices
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
@@ -87,25 +88,40 @@ def train(config: Config, run_dir: Path, stop: StopSignal, resume: bool = False)
     Raises:
         ConfigError: anything the user can mend, before the first compile where possible.
     """
+    # All that refuses a configuration stands before the stores: they are what makes a run begin.
+    device = prepare_jax(config)
+    check_devices(config, parallel.size(parallel.make_mesh()))
+    session = Session(config)
     with full_store(run_dir, config.checkpoint.keep) as full, policy_store(run_dir) as policy:
-        return _Run(config, run_dir, full, policy, stop).go(resume)
+        return _Run(config, run_dir, session, full, policy, stop).go(device, resume)
+
+
+class _Stopped(Exception):
+    """The final evaluation is left: it was asked to stop."""
 
 
 class _Run:
     """One process's share of a run."""
 
-    def __init__(self, config: Config, run_dir: Path, full: Any, policy: Any, stop: StopSignal):
+    def __init__(
+        self,
+        config: Config,
+        run_dir: Path,
+        session: Session,
+        full: Any,
+        policy: Any,
+        stop: StopSignal,
+    ):
         self.config, self.run_dir, self.stop = config, run_dir, stop
-        self.full, self.policy = full, policy
+        self.session, self.full, self.policy = session, full, policy
         self.schedule = Schedule.of(config)
-        self.console = Console(config.log.progress)
+        # Who cannot be told what happens has left: the run saves and ends.
+        self.console = Console(config.log.progress, on_error=stop.request)
         self.say = self.console.line
 
-    def go(self, resume: bool) -> int:
-        self.say(f"device: {prepare_jax(self.config)}")
+    def go(self, device: str, resume: bool) -> int:
+        self.say(f"device: {device}")
         mesh = parallel.make_mesh()
-        check_devices(self.config, parallel.size(mesh))
-        self.session = Session(self.config)
         iteration = make_train_iteration(
             self.config,
             self.session.env,
@@ -131,12 +147,7 @@ class _Run:
             while self.iterations_left() and not self.stop.requested:
                 self.step()
             self.save()
-            if self.stop.requested:
-                self.say(
-                    f"stopped after iteration {self.done}; go on with: {self.resume_command()}"
-                )
-                return 0
-            return self.finish()
+            return self.leave() if self.stop.requested else self.finish()
         finally:
             self.csv.close()
             self.console.close()
@@ -171,8 +182,8 @@ class _Run:
         write_versions(self.run_dir / "versions.json")
         self.tensorboard = None
         if config.log.tensorboard:
-            resume_at = self.done * self.schedule.steps_per_iteration if resume else None
-            self.tensorboard = TensorBoard(self.run_dir / "tensorboard", resume_at)
+            begun = time.time() - self.wall
+            self.tensorboard = TensorBoard(self.run_dir / "tensorboard", self.csv.rows(), begun)
         self.evaluator = self.session.evaluator()
         self.clock = time.monotonic() - self.wall
         self.save()
@@ -202,7 +213,10 @@ class _Run:
     def step(self) -> None:
         """One iteration, its row, and whatever is due after it."""
         config, started = self.config, time.monotonic()
-        self.state, metrics = self.iteration(self.state)
+        # Of a whole iteration jax could only say that there is a NaN, and iteration 0's losses are
+        # NaN on purpose; `check_health` does what JAX_DEBUG_NANS asks for.
+        with jax.debug_nans(False), jax.debug_infs(False):
+            self.state, metrics = self.iteration(self.state)
         metrics = jax.tree.map(np.asarray, metrics)
         seconds = time.monotonic() - started
         self.done += 1
@@ -235,17 +249,24 @@ class _Run:
         return self.done > 0 and self.done % self.config.checkpoint.policy_every == 0
 
     def check_health(self, row: dict[str, Any]) -> None:
-        """Warns of what was skipped or put back; stops a run that cannot recover by itself."""
+        """Warns of what was skipped or put back; stops a run that cannot recover by itself.
+
+        Under JAX_DEBUG_NANS or JAX_DEBUG_INFS it stops at the first.
+        """
+        is_strict = jax.config.jax_debug_nans or jax.config.jax_debug_infs
         config, iteration = self.config, row["iteration"]
         kept = f"{self.full.directory} keeps iteration {self.full.steps()[-1]}"
         skipped, faults = row.get("train/skipped") or 0.0, int(row["train/physics_faults"])
-        if skipped == 1.0:
+        if skipped == 1.0 or (skipped and is_strict):
+            share = (
+                "every gradient was" if skipped == 1.0 else f"{skipped:.1%} of the gradients were"
+            )
             raise ConfigError(
-                f"iteration {iteration}: every gradient was non-finite",
+                f"iteration {iteration}: {share} non-finite",
                 f"start a new run with a lower sac.lr; {kept}",
             )
         # As many as a whole task collects: what is learned from is no longer the task.
-        if faults >= lanes_per_task(config) * config.env.horizon:
+        if faults >= lanes_per_task(config) * config.env.horizon or (faults and is_strict):
             other = "native" if config.env.physics == "mjx" else "mjx"
             raise ConfigError(
                 f"iteration {iteration}: the physics of {faults} of "
@@ -271,13 +292,15 @@ class _Run:
         }
         return row | {"time/evaluation_s": time.monotonic() - started}
 
-    def scores(self, goals: int, k: tuple[int, ...]) -> dict[str, Any]:
+    def scores(
+        self, goals: int, k: tuple[int, ...], check: Callable[[], None] = lambda: None
+    ) -> dict[str, Any]:
         params = parallel.on_one_device(policy_params(self.state.learner))
         trial = self.session.trial(self.config.eval.goal_set, goals)
         if not self.evaluator.is_compiled:
             width = trial.texts.shape[-1]
             self.timed("the evaluation episode", lambda: self.evaluator.compile(params, width))
-        scores = self.evaluator.run([params], trial, k, self.config.eval.seed)
+        scores = self.evaluator.run([params], trial, k, self.config.eval.seed, check)
         return summarise(of_policy(scores, 0), trial.tasks)
 
     def share_done(self) -> float:
@@ -314,9 +337,15 @@ class _Run:
             self.policy.save({"policy": policy}, meta)
 
     def finish(self) -> int:
-        """The final evaluation: more goals, every k, written beside the CSV."""
+        """The final evaluation: more goals, every k, written beside the CSV.
+
+        Left at once where a stop is asked for: all is saved, and a resumed run evaluates anew.
+        """
         evaluation = self.config.eval
-        summary = self.scores(evaluation.final_goals, evaluation.final_k)
+        try:
+            summary = self.scores(evaluation.final_goals, evaluation.final_k, self.check_stop)
+        except _Stopped:
+            return self.leave()
         result = {
             "tasks": summary,
             "goals": evaluation.final_goals,
@@ -329,6 +358,20 @@ class _Run:
         self.say(format_scores(summary))
         self.say(f"done in {format_duration(self.wall)}: {self.run_dir}")
         return 0
+
+    def check_stop(self) -> None:
+        if self.stop.requested:
+            raise _Stopped
+
+    def leave(self) -> int:
+        """Says how a saved run goes on; returns the exit code."""
+        text = f"stopped after iteration {self.done}; go on with: {self.resume_command()}"
+        self.say(text)
+        if self.console.error is None:
+            return 0
+        to_stderr(text)
+        is_left = self.console.error.errno in READER_LEFT
+        return 0 if is_left else exit_code(self.console.error)
 
     def resume_command(self) -> str:
         return command("--run", self.run_dir, "--resume")

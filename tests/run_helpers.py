@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from cmrl_jax.config_io import load_config
 from cmrl_jax.session import Session
 
 ROOT = Path(__file__).resolve().parent.parent
+TRAIN = (sys.executable, str(ROOT / "train.py"))
 ITERATIONS = 4  # of the undisturbed native run
 
 
@@ -35,10 +37,14 @@ def smoke(run, *words):
     return main(smoke_words(run, *words))
 
 
-def start(run, *words, **environment):
-    """A run of smoke.yaml in a process of its own, its lines on `stdout`."""
+def start(run, *words, under=(), **environment):
+    """A run of smoke.yaml in a process of its own, its lines on `stdout`.
+
+    Args:
+        under: a command that starts it, such as `nohup`.
+    """
     return subprocess.Popen(
-        [sys.executable, str(ROOT / "train.py"), *smoke_words(run, *words)],
+        [*under, *TRAIN, *smoke_words(run, *words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -47,13 +53,19 @@ def start(run, *words, **environment):
     )
 
 
-def run_and_signal(run, marker, *words, signals=(signal.SIGTERM,), **environment):
+def run_in_shell(redirection, *words, **environment):
+    """`train.py WORDS` with its streams as a shell's `redirection` leaves them."""
+    command = ["sh", "-c", f'exec "$@" {redirection}', "sh", *TRAIN, *words]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
+
+
+def run_and_signal(run, marker, *words, signals=(signal.SIGTERM,), under=(), **environment):
     """A run in a process of its own that gets `signals` when it prints `marker`.
 
     Returns:
         Its exit code and its lines.
     """
-    with start(run, *words, **environment) as process:
+    with start(run, *words, under=under, **environment) as process:
         assert process.stdout is not None
         lines = []
         for line in process.stdout:
@@ -70,6 +82,40 @@ def rows_of(run):
         rows = list(csv.DictReader(file))
     is_clock = lambda column: column == "wall_s" or column.startswith("time/")
     return [{c: text for c, text in row.items() if not is_clock(c)} for row in rows]
+
+
+def tensorboard_points(directory):
+    """(env step, tag, figure) of the points in a directory, as TensorBoard shows them.
+
+    A START drops every point of its step and of later ones.
+    """
+    from tensorboardX.proto import event_pb2
+
+    events: Any = event_pb2
+    points = []
+    for path in sorted(directory.glob("events.*")):
+        data = path.read_bytes()
+        while data:  # records: length (8 bytes), checksum (4), event, checksum (4)
+            length = int.from_bytes(data[:8], "little")
+            event = events.Event.FromString(data[12 : 12 + length])
+            if event.session_log.status == events.SessionLog.START:
+                points = [point for point in points if point[0] < event.step]
+            points += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
+            data = data[16 + length :]
+    return sorted(points)
+
+
+def csv_points(path):
+    """The figures of metrics.csv in the form of `tensorboard_points`."""
+    with open(path, newline="") as file:
+        rows = list(csv.DictReader(file))
+    leading = ("iteration", "env_steps", "gradient_steps", "wall_s", "seed")
+    return sorted(
+        (int(row["env_steps"]), name, float(np.float32(text)))
+        for row in rows
+        for name, text in row.items()
+        if text and name not in leading
+    )
 
 
 def leaves_of(tree):
@@ -91,6 +137,12 @@ def checkpoint_leaves(run, step=None):
     with full_store(run, read_only=True) as store:
         trees, meta = store.restore(abstract_run(run), step=step)
     return leaves_of(trees), meta
+
+
+def steps(run):
+    """Iterations of a run's full checkpoints."""
+    with full_store(run, read_only=True) as store:
+        return store.steps()
 
 
 def policy_steps(run):
@@ -117,3 +169,9 @@ def assert_same_result(run, other):
     timed = ("wall_s", "csv_offset")
     for name in expected_meta.keys() - timed:
         assert meta[name] == expected_meta[name], name
+
+
+def go_on(run, undisturbed):
+    """Resumes a run to its end, which must be that of the undisturbed one."""
+    assert smoke(run, *native(), "--resume") == 0
+    assert_same_result(run, undisturbed)

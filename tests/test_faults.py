@@ -20,13 +20,14 @@ import pytest
 from run_helpers import (
     ITERATIONS,
     abstract_run,
-    assert_same_result,
     checkpoint_leaves,
+    go_on,
     native,
     rows_of,
     run_and_signal,
     smoke,
     start,
+    steps,
 )
 
 from cmrl_jax.checkpoint import full_store, policy_store
@@ -58,16 +59,6 @@ def unfinished(undisturbed, tmp_path):
         shutil.rmtree(run / store / str(ITERATIONS))
     (run / "eval.json").unlink()
     return run
-
-
-def steps(run):
-    with full_store(run, read_only=True) as store:
-        return store.steps()
-
-
-def go_on(run, undisturbed):
-    assert smoke(run, *native(), "--resume") == 0
-    assert_same_result(run, undisturbed)
 
 
 # Signals and kills ------------------------------------------------------------------------------

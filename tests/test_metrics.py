@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_helpers import csv_points, tensorboard_points
 
 from cmrl_jax import metrics
 from cmrl_jax.config import ConfigError
@@ -122,19 +123,46 @@ def test_columns_and_rows_are_checked(tmp_path):
 
 
 def test_tensorboard_events_hold_the_figures(tmp_path):
-    event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
-
+    pytest.importorskip("tensorboardX")
     sink = metrics.TensorBoard(tmp_path)
     sink.write(make_row(3, **{"train/critic_loss": jnp.float32(0.25), "train/absent": None}))
     sink.close()
-    (path,) = tmp_path.glob("events.*")
-    data, found = path.read_bytes(), []
-    while data:  # records: length (8 bytes), checksum (4), event, checksum (4)
-        length = int.from_bytes(data[:8], "little")
-        event = event_pb2.Event.FromString(data[12 : 12 + length])
-        found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
-        data = data[16 + length :]
-    assert found == [(30, "train/critic_loss", 0.25)]
+    assert tensorboard_points(tmp_path) == [(30, "train/critic_loss", 0.25)]
+
+
+def test_a_killed_process_leaves_every_row_in_tensorboard(tmp_path):
+    pytest.importorskip("tensorboardX")
+    script = "import os, sys; from pathlib import Path; from cmrl_jax.metrics import TensorBoard\n"
+    script += "sink = TensorBoard(Path(sys.argv[1]))\n"
+    script += "row = {'env_steps': 10, 'wall_s': 0.5} | {f'train/{i}': i for i in range(40)}\n"
+    script += "sink.write(row); os._exit(0)"
+    subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
+    assert tensorboard_points(tmp_path) == sorted((10, f"train/{i}", i) for i in range(40))
+
+
+def test_a_resumed_file_and_tensorboard_have_every_row_once(tmp_path):
+    """The checkpoint is that of row 1; row 2 was written after it, row 3 never."""
+    pytest.importorskip("tensorboardX")
+    path, figure = tmp_path / "metrics.csv", "train/critic_loss"
+
+    def process(iterations, offset=None):
+        """Writes rows as one process does; returns the length of the CSV after each."""
+        csv = metrics.MetricsCsv(path, COLUMNS, offset)
+        board = metrics.TensorBoard(tmp_path, csv.rows())
+        offsets = []
+        for iteration in iterations:
+            row = make_row(iteration, **{figure: 0.1 * iteration})
+            csv.write(row)
+            board.write(row)
+            offsets.append(csv.offset)
+        csv.close()
+        board.close()
+        return offsets
+
+    offsets = process((0, 1, 2))
+    process((2, 3), offset=offsets[1])
+    expected = [(10 * i, figure, float(np.float32(0.1 * i))) for i in range(4)]
+    assert tensorboard_points(tmp_path) == csv_points(path) == expected
 
 
 def test_missing_tensorboard_names_its_cure(tmp_path, monkeypatch):

@@ -1,18 +1,22 @@
 """A resumed run is the undisturbed run, bit for bit, in a new process."""
 
 import json
+import shutil
 import subprocess
 import sys
 
+import pytest
 from run_helpers import (
     ITERATIONS,
     ROOT,
     assert_same_result,
+    csv_points,
     native,
     policy_steps,
     rows_of,
     smoke,
     smoke_words,
+    tensorboard_points,
 )
 
 HALF = ITERATIONS // 2
@@ -34,6 +38,14 @@ def test_resume_in_a_new_process_equals_an_undisturbed_run(undisturbed, tmp_path
     assert_same_result(run, undisturbed)
     scores = [json.loads((r / "eval.json").read_text()) for r in (run, undisturbed)]
     assert scores[0] == scores[1]
+
+
+def test_tensorboard_has_every_row_once_wherever_it_is_switched_on(undisturbed, tmp_path):
+    pytest.importorskip("tensorboardX")
+    run = tmp_path / "run"
+    shutil.copytree(undisturbed, run)
+    assert smoke(run, *native(), "--log.tensorboard", "true", "--resume") == 0
+    assert tensorboard_points(run / "tensorboard") == csv_points(run / "metrics.csv")
 
 
 def test_policies_are_kept_by_iterations_not_by_the_clock(tmp_path):

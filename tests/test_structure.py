@@ -29,6 +29,7 @@ LIGHT = {
     "run_files",
     "run_groups",
     "stop",
+    "streams",
     "flags",
     "evaluate_flags",
     "render_flags",
@@ -83,9 +84,18 @@ ROWS = (
         "inspection_file",
     },
     {"goal_files", "pca", "run_files", "old_statistics"},
-    {"manifest", "named_arrays", "parallel", "moments", "locks", "documents"},
+    {
+        "manifest",
+        "named_arrays",
+        "parallel",
+        "jax_runtime",
+        "stop",
+        "moments",
+        "locks",
+        "documents",
+    },
     {"validate", "yaml_tree"},
-    {"config", "commands"},
+    {"config", "commands", "streams"},
 )
 
 

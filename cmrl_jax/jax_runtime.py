@@ -1,0 +1,84 @@
+"""What this process asks of jax before any work: switches it can work with, a device, a cache.
+
+jax reads dozens of switches from the environment (JAX_DEBUG_NANS). Those that this program cannot
+run under, or under which a seed would name other numbers, are refused here by name; all others
+work, or are the user's own business.
+"""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from cmrl_jax.config import ConfigError
+from cmrl_jax.streams import to_stderr
+
+ALLOWED = (None, "allow", "log", "log_explicit")
+GUARDS = ("", "_host_to_device", "_device_to_host", "_device_to_device")
+SEED = "a seed would name other numbers"
+# Switch -> the values that work, and why others do not.
+SWITCHES: dict[str, tuple[tuple[Any, ...], str]] = {
+    "jax_enable_x64": ((False,), "states and checkpoints are float32"),
+    "jax_disable_jit": ((False,), "op by op it takes minutes to get to the first iteration"),
+    "jax_debug_key_reuse": ((False,), "an evaluation splits its key twice, once for each half"),
+    "jax_numpy_rank_promotion": (("allow", "warn"), "a network's bias is broadcast over lanes"),
+    "jax_numpy_dtype_promotion": (("standard",), "brax's statistics mix uint32 with int32"),
+    "jax_default_prng_impl": (("threefry2x32",), SEED),
+    "jax_threefry_partitionable": ((True,), SEED),
+    "jax_random_seed_offset": ((0,), SEED),
+} | {
+    f"jax_transfer_guard{way}": (ALLOWED, "the host reads figures and writes goals all the time")
+    for way in GUARDS
+}
+
+
+def check_switches() -> None:
+    """Raises ConfigError naming the first switch of jax that is set to what does not work here."""
+    for name, (works, reason) in SWITCHES.items():
+        value = getattr(jax.config, name)
+        if value not in works:
+            shown = str(value).lower() if isinstance(value, bool) else value
+            cause = f"{name.upper()} is {shown}, which is not supported: {reason}"
+            raise ConfigError(cause, f"unset {name.upper()}, and start again")
+
+
+def first_device() -> Any:
+    """The `jax.Device` that programs run on.
+
+    Raises:
+        ConfigError: there is none of the kind that JAX_PLATFORMS asks for.
+    """
+    try:
+        return jax.devices()[0]
+    # What jax raises depends on whether it knows the platform, and on what its plugin says.
+    except (RuntimeError, AssertionError) as error:
+        platforms = jax.config.jax_platforms  # pyright: ignore[reportAttributeAccessIssue]
+        lines = str(error).splitlines() or ["it has no such backend"]
+        cause = f"jax finds no device for JAX_PLATFORMS={platforms}: {lines[0][:200]}"
+        cure = "unset JAX_PLATFORMS to take the device that is there, or install jax for that one"
+        raise ConfigError(cause, cure) from error
+
+
+@functools.cache  # so that a process that asks again is not told again
+def cache_directory(text: str) -> str | None:
+    """A directory for compiled programs, made if need be; None, with a warning, where none can be.
+
+    Args:
+        text: `runtime.compile_cache`.
+    """
+    try:
+        path = Path(text).expanduser()
+        path.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path).close()
+    except RuntimeError:
+        reason = f"there is no home directory for {text}"
+    except OSError as error:
+        reason = f"{path} cannot be written: {error.strerror}"
+    else:
+        return str(path)
+    to_stderr(f"warning: {reason}; programs are compiled at each start (runtime.compile_cache)")
+    return None
