@@ -37,22 +37,22 @@ class ConfigError(ValueError):
         self.cure = cure
 
 
-def call_envs(build: Callable[[], Any]) -> Any:
+def call_envs(build: Callable[[], Any], about: str = "") -> Any:
     """Calls into `envs`, whose ValueErrors carry cause and cure on two lines."""
-    with as_config_error():
+    with as_config_error(about):
         return build()
 
 
 @contextlib.contextmanager
-def as_config_error() -> Iterator[None]:
-    """Such errors as ConfigErrors."""
+def as_config_error(about: str = "") -> Iterator[None]:
+    """Such errors as ConfigErrors; `about` begins the cause, as the key that it stands under."""
     try:
         yield
     except ValueError as error:
         cause, _, cure = str(error).partition("\n")
         if not cure:
             raise
-        raise ConfigError(cause, cure) from error
+        raise ConfigError(f"{about}{cause}", cure) from error
 
 
 def doc(

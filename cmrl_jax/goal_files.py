@@ -31,7 +31,7 @@ def find_table(table: str) -> Path:
     else:
         encoder = DEFAULT_TABLE if table in GOAL_ABLATIONS else table
         path, build = table_path(encoder), command("goals", "--encoder", encoder)
-    lies_there = call_envs(lambda: what_is(path))
+    lies_there = call_envs(lambda: what_is(path), "goals.table: ")
     if lies_there != "file":
         state = "is a directory" if lies_there == "directory" else "does not exist"
         cause = f"the goal table {brief(table)} is not there: {brief(path)} {state}"

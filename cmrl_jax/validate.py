@@ -15,6 +15,7 @@ from cmrl_jax.config import (
     TEXT_ENCODERS,
     Config,
     ConfigError,
+    call_envs,
     lane_groups,
     lanes_per_task,
     leaves,
@@ -206,11 +207,7 @@ def check_devices(config: Config, devices: int) -> None:
 
 def check_goal_set(name: str, key: str) -> None:
     """Raises ConfigError unless `name` is the one name of a goal set; see `goal_names.seed_of`."""
-    try:
-        seed_of(name)
-    except ValueError as error:
-        cause, cure = str(error).split("\n")
-        raise ConfigError(f"{key} {cause}", cure) from error
+    call_envs(lambda: seed_of(name), f"{key} ")
 
 
 def _check_eval(config: Config) -> None:
