@@ -72,7 +72,7 @@ def _outcome(words: list[str]) -> int:
     except ConfigError as error:
         return _refuse(error.cause, error.cure)
     except ValueError as error:
-        if _raised_in(error) != "jax._src.config":
+        if not _stopped_its_import(error, "jax"):
             raise
         return _refuse(f"jax does not start: {error}", "correct that variable, or unset it")
     except (KeyboardInterrupt, RuntimeError) as error:
@@ -88,12 +88,13 @@ def _refuse(cause: str, cure: str) -> int:
     return 2
 
 
-def _raised_in(error: BaseException) -> str:
-    """Name of the module whose code raised an error."""
+def _stopped_its_import(error: BaseException, package: str) -> bool:
+    """Whether code of a package raised an error that kept the package from being imported."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    return "" if trace is None else trace.tb_frame.f_globals.get("__name__", "")
+    module = "" if trace is None else trace.tb_frame.f_globals.get("__name__", "")
+    return module.partition(".")[0] == package and package not in sys.modules
 
 
 def _dispatch(words: list[str]) -> int:

@@ -6,8 +6,6 @@ byte. `goals.py` reads it.
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,7 @@ from cmrl_jax.flags import writable
 from cmrl_jax.goal_files import PROMPTS_FILE, table_path
 from cmrl_jax.goals import GoalTable, read_table
 from cmrl_jax.yaml_tree import read_tree
-from envs.outputs import replacing
+from envs.npz import write_npz
 
 
 def read_prompts(path: Path = PROMPTS_FILE) -> dict[str, dict[str, list[str]]]:
@@ -100,7 +98,7 @@ def build(
         "tokenizer_sha256": np.array(found.tokenizer_sha256),
         "prompts_sha256": np.array(file_sha256(prompts_file)),
     }
-    call_envs(lambda: _write(out, tables))
+    call_envs(lambda: write_npz(out, tables))
     return out
 
 
@@ -151,12 +149,3 @@ def _check_replaceable(out: Path, found: Encoder) -> None:
         there = "no goal table"
     cause = f"{out} is {there}, and would become one of {found.name}"
     raise ConfigError(cause, "give another file with --out F, or replace it with --force")
-
-
-def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with replacing(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
-        for key, array in sorted(arrays.items()):
-            # np.savez stamps the time of day on each member; a fixed date keeps the file equal.
-            entry = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-            with archive.open(entry, "w") as member:
-                np.lib.format.write_array(member, array)

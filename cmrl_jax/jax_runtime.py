@@ -26,7 +26,7 @@ SWITCHES: dict[str, tuple[tuple[Any, ...], str]] = {
     "jax_disable_jit": ((False,), "op by op it takes minutes to get to the first iteration"),
     "jax_debug_key_reuse": ((False,), "an evaluation splits its key twice, once for each half"),
     "jax_numpy_rank_promotion": (("allow", "warn"), "a network's bias is broadcast over lanes"),
-    "jax_numpy_dtype_promotion": (("standard",), "brax's statistics mix uint32 with int32"),
+    "jax_numpy_dtype_promotion": (("standard",), "masks of whole numbers weigh float32"),
     "jax_default_prng_impl": (("threefry2x32",), SEED),
     "jax_threefry_partitionable": ((True,), SEED),
     "jax_random_seed_offset": ((0,), SEED),

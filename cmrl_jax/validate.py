@@ -24,8 +24,6 @@ from cmrl_jax.config import (
 from envs.command_line import LARGEST
 from envs.goal_names import seed_of
 
-MAX_INT = 2**31 - 1  # jax counts and indexes in 32 bits; `high` of a field that may be larger
-
 # Options of the schema whose code is not there yet: refused by name, so that nobody trains for an
 # hour on a switch that does nothing.
 NOT_BUILT = {
@@ -68,8 +66,6 @@ def _check_bounds(config: Config) -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, bool | str):
                 continue
-            if high is None and isinstance(number, int):
-                high = MAX_INT
             lower = f"above {above}" if above is not None else f"at least {low}"
             inside = number > above if above is not None else number >= low
             if high is None and isinstance(number, int):

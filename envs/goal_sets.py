@@ -27,7 +27,8 @@ import numpy as np
 
 from envs.command_line import Parser, run, typed_path
 from envs.goal_names import GOALS, SEEDS, seed_of
-from envs.outputs import FORCE_HELP, check_output, replacing
+from envs.npz import write_npz
+from envs.outputs import FORCE_HELP, check_output
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 
@@ -110,7 +111,7 @@ def draw_goals(task: str, seed: int) -> np.ndarray:
 def write_packaged(path: Path = _PACKAGED) -> None:
     """Draws `train` and `heldout` for every task and writes them to `path`, byte for byte the
     same each time."""
-    _write(path, {f"{n}/{t}": draw_goals(t, seed) for n, seed in SEEDS.items() for t in TASKS})
+    write_npz(path, {f"{n}/{t}": draw_goals(t, seed) for n, seed in SEEDS.items() for t in TASKS})
 
 
 def _fresh(task: str, seed: int, cache: Path | None) -> np.ndarray:
@@ -120,7 +121,7 @@ def _fresh(task: str, seed: int, cache: Path | None) -> np.ndarray:
     if not os.path.isfile(path):  # nor is one that cannot be looked at
         goals = draw_goals(task, seed)
         try:
-            _write(path, {"goals": goals})
+            write_npz(path, {"goals": goals})
         except (OSError, ValueError):
             # The cache saves a second at the next start; a read-only home must not stop a run.
             return goals
@@ -153,17 +154,6 @@ def _goals(arrays: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
             "python -m envs.goal_sets writes the packaged file again; delete a cached one"
         )
     return goals
-
-
-def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Writes an npz whose bytes depend on the arrays alone, and only ever whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
-        for key in sorted(arrays):
-            # np.savez stamps the time of day on each member; a fixed date keeps the file equal.
-            entry = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-            with archive.open(entry, "w") as member:
-                np.lib.format.write_array(member, np.ascontiguousarray(arrays[key]))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -114,10 +114,10 @@ def _write_pictures(argv: Sequence[str] | None) -> None:
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
     args = parser.parse_args(argv)
     out = args.out
+    choose_gl()  # before a directory is made for pictures that cannot be drawn
     make_directory(out, "--out")
     for scene in SCENES:
         check_output(out / f"{scene}.png", "--out", written_by("envs.picture"), args.force)
-    choose_gl()
     for scene in SCENES:
         write_picture(scene, out / f"{scene}.png")
         print(out / f"{scene}.png")

@@ -53,7 +53,7 @@ def test_fresh_goals_need_no_home(no_home, monkeypatch):
 
 
 def test_fresh_goals_need_no_cache_that_may_be_entered(monkeypatch, tmp_path):
-    """A home of another user, as HOME=/root is for everybody else."""
+    """A home of another user, as the superuser's is for everybody else."""
     (tmp_path / "goals").mkdir()
     tmp_path.chmod(0)
     monkeypatch.setattr(goal_sets, "draw_goals", lambda task, seed: [task, seed])
