@@ -17,6 +17,7 @@ from typing import Any
 from cmrl_jax.config import ConfigError
 from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.locks import lock
+from envs.outputs import in_directory
 
 FIGURES = {
     "success_any": "success_any",
@@ -76,7 +77,7 @@ class CellTable:
         if path is None:
             return
         try:
-            self._file = open(path, "a+b", buffering=0)
+            self._file = open(in_directory(path), "a+b", buffering=0)
             lock(self._file, str(path))
             self._file.seek(0)
             self._go_on(path, self._file.read(), force)

@@ -30,7 +30,8 @@ def written_by(command: str) -> str:
 def check_output(path: Path, flag: str, mark: str, force: bool = False) -> None:
     """Whether a command may write a file; asked before its work rather than after an hour of it.
 
-    Makes the directory of the file. What is no regular file (a pipe, /dev/null) holds nothing.
+    Leaves nothing behind, so that a command which is refused has made no directory. What is no
+    regular file (a pipe, /dev/null) holds nothing.
 
     Args:
         flag: what the user named the file with.
@@ -41,15 +42,13 @@ def check_output(path: Path, flag: str, mark: str, force: bool = False) -> None:
         ValueError: it may not, or cannot (two lines: cause, cure).
     """
     try:
-        if path.is_dir():
+        target = Path(os.path.realpath(path))
+        if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if path.exists() and not os.access(path, os.W_OK):  # a rename would not ask
+        if target.exists() and not os.access(target, os.W_OK):  # a rename would not ask
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         if not _is_special(path):
-            part = _part_of(path)
-            part.parent.mkdir(parents=True, exist_ok=True)
-            part.touch()
-            part.unlink()
+            _try(target)
         is_foreign = path.is_file() and path.stat().st_size > 0 and not _contains(path, mark)
     except OSError as error:
         raise ValueError(_refusal(path, flag, error)) from error
@@ -69,10 +68,11 @@ def replacing(path: Path, flag: str = "--out") -> Iterator[Path]:
         if _is_special(path):
             yield path
             return
-        part = _part_of(path)
+        target = in_directory(path)
+        part = _part_of(target)
         try:
             yield part
-            part.replace(os.path.realpath(path))
+            part.replace(target)
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
@@ -99,6 +99,28 @@ def save_figure(figure: Any, path: Path, command: str, flag: str = "--out", **op
     key = "Software" if path.suffix.lower() == ".png" else "Creator"
     with replacing(path, flag) as part:
         figure.savefig(part, metadata={key: written_by(command)}, **options)
+
+
+def in_directory(path: Path) -> Path:
+    """`path` with its links followed and its directory made."""
+    target = Path(os.path.realpath(path))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    return target
+
+
+def _try(target: Path) -> None:
+    """Makes and removes a file beside the one to be, and the directories that it needs."""
+    missing = [folder for folder in target.parents if not folder.exists()]
+    try:
+        part = _part_of(in_directory(target))
+        part.touch()
+        part.unlink()
+        with contextlib.suppress(FileNotFoundError):
+            os.stat(target)  # its own name may be too long
+    finally:
+        for folder in missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
 
 def _is_special(path: Path) -> bool:

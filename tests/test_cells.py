@@ -34,10 +34,10 @@ ROWS = [row(k, goal) for k in (0, 1) for goal in range(5)]
 
 @pytest.fixture
 def path(tmp_path):
-    """A table of the first seven rows."""
-    with CellTable(tmp_path / "s.csv") as table:
+    """A table of the first seven rows, in a directory of its own that was not there."""
+    with CellTable(tmp_path / "new" / "s.csv") as table:
         assert table.add(ROWS[:7]) == ROWS[:7]
-    return tmp_path / "s.csv"
+    return tmp_path / "new" / "s.csv"
 
 
 def test_a_table_is_gone_on_with(path):
