@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 
 from cmrl_jax import normalizers, parallel, replay
@@ -42,7 +43,7 @@ class TrainState:
         encoder_params: None unless `model.conditioning` is z.
         log_alpha: log temperature of every training task, (T,).
         obs_stats, return_stats: running statistics (normalizers.py), updated by collection.
-        gradient_steps: gradient steps applied, int32.
+        gradient_steps: gradient steps applied, int32; exact below 2^31, where it stands still.
         skipped_updates: gradient steps dropped for a non-finite gradient, int32.
     """
 
@@ -293,7 +294,7 @@ def make_learner(
             )
             new = replace(new, log_alpha=log_alpha, alpha_opt_state=opt_state)
 
-        new = replace(new, gradient_steps=state.gradient_steps + 1)
+        new = replace(new, gradient_steps=optax.safe_increment(state.gradient_steps))
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(norm)) for norm in norms.values()]))
         new = jax.lax.cond(finite, lambda: new, lambda: state)
         skipped = 1 - finite.astype(jnp.int32)

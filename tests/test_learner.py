@@ -229,6 +229,8 @@ def test_one_step_moves_every_network_and_the_targets_by_tau(variant, ring, cmrl
     state = built.state
     new, metrics = built.update(state, ring, ring, jax.random.key(1))
     assert int(new.gradient_steps) == 1 and int(new.skipped_updates) == 0
+    full = replace(state, gradient_steps=jnp.int32(2**31 - 1))  # it stands still, and never wraps
+    assert built.update(full, ring, ring, jax.random.key(1))[0].gradient_steps == 2**31 - 1
     assert all(bool(np.isfinite(np.asarray(v)).any()) for v in metrics.values())
     for f in fields(state):
         old, moved = getattr(state, f.name), getattr(new, f.name)
