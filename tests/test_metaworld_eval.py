@@ -30,8 +30,8 @@ from cmrl_jax.replay import Transition
 from cmrl_jax.session import Policy, Session
 from envs.metaworld_envs import make_vector_env, set_goals
 from envs.reference import record_rollout
-from envs.sawyer import OBJECT, OBS_SIZE
-from envs.tasks import TASKS, task_id
+from envs.sawyer import OBS_SIZE
+from envs.tasks import TASKS
 
 LANES = 2
 
@@ -165,50 +165,6 @@ def test_noise_of_sampled_actions_is_the_lanes_episodes_and_steps_own(session, p
     assert not np.array_equal(alone[0], wanted[0])
     noise = agent._noise
     assert len(np.unique(noise)) == noise.size == LANES * HORIZON * 4
-
-
-@pytest.fixture(scope="module")
-def canonical():
-    return Session(small_config(**{"env.obs_mode": "canonical"}))
-
-
-def test_canonical_observations(canonical, policy, trial):
-    """On every task, and where an episode's first observation came with the last of another."""
-    trial = replace(trial, z="text")
-    evaluator = Evaluator(canonical.config, canonical.env, canonical.learner, lanes=8)
-    native = evaluator.run([policy.params], trial, (0, 1), seed=3)
-    for row in range(len(TASKS)):
-        found = k_shot(canonical, policy, of_task(trial, row), (0, 1), HORIZON, seed=3)
-        for k in (0, 1):
-            wanted = native[k].returns[0, row]
-            np.testing.assert_allclose(found[k].returns[0], wanted, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("task", ["window-close", "drawer-open"])
-def test_canonical_observations_in_metaworld_have_the_origin_of_ours(
-    canonical, policy, trial, task
-):
-    """What the agent is shown, step by step over two episodes, is what our environment shows."""
-    one = of_task(trial, canonical.eval_tasks.index(task))
-    envs = make_vector_env(task, one.placements[0], LANES, HORIZON)
-    envs.call("toggle_terminate_on_success", False)
-    set_goals(envs, task, one.placements[0], False)
-    agent = agent_of(canonical, policy, one, [np.arange(LANES)], HORIZON, seed=3)
-    agent.init()
-    start = jax.vmap(canonical.env.reset_to, (None, 0))(
-        task_id(task), jnp.float32(one.placements[0])
-    )
-    state, (seen, _) = start, envs.reset()
-    for step in range(2 * HORIZON):
-        state = start if step % HORIZON == 0 else state
-        action = agent.eval_action(seen)
-        np.testing.assert_allclose(agent._shown, state.obs, atol=1e-5)
-        if step % HORIZON == 1:
-            np.testing.assert_allclose(agent._shown[:, OBJECT], 0, atol=1e-3)
-        seen, _, _, truncated, _ = envs.step(action)
-        agent.reset(truncated)
-        state = jax.vmap(canonical.env.step)(state, action)
-    envs.close()
 
 
 def test_a_policy_that_is_told_the_task(trial):
