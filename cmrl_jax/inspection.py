@@ -7,7 +7,6 @@ checkpoint does not hold them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -139,11 +138,18 @@ def usage_of(routing: Routing | None, tasks: int) -> Usage | None:
     """Use of modules by task, from the mean routing of lanes (lane, ...) in the order of tasks."""
     if routing is None:
         return None
-    by_task = lambda x: np.asarray(x).reshape(tasks, -1, *x.shape[1:]).mean(1)
+
+    def by_task(x: jax.Array) -> np.ndarray:
+        return np.asarray(x).reshape(tasks, -1, *x.shape[1:]).mean(1)
+
     matrices, final = by_task(routing.matrices), by_task(routing.final)
 
-    def over_readers(reduce: Callable[..., np.ndarray]) -> np.ndarray:
-        layers = reduce(matrices, axis=-2)  # over targets; sources are the last axis
+    def with_output(layers: np.ndarray) -> np.ndarray:
         return np.concatenate([layers, final[:, None]], axis=1)  # the output is one reader
 
-    return Usage(*map(over_readers, (np.mean, np.min, np.max)))
+    # Over targets; sources are the last axis.
+    return Usage(
+        mean=with_output(matrices.mean(-2)),
+        low=with_output(matrices.min(-2)),
+        high=with_output(matrices.max(-2)),
+    )

@@ -37,7 +37,7 @@ def examples(count: int) -> settings:
         derandomize=TIMES == 1,
         deadline=None,
         database=None,
-        suppress_health_check=list(HealthCheck),
+        suppress_health_check=[check for check in HealthCheck],
     )
 
 
