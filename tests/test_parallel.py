@@ -33,14 +33,20 @@ def on_four_devices(run, *words):
 
 
 def assert_close_training(run, other):
-    """The same draws throughout; sums over lanes and batch are made in another order."""
-    for row, expected in zip(rows_of(run), rows_of(other), strict=True):
+    """The same draws throughout; sums over lanes and batch are made in another order.
+
+    What differs by rounding in the first gradient differs by a step in a weight whose gradient is
+    about zero, since Adam divides one by the other: measured after 30 steps, 3 % of a small bias's
+    norm and 3e-3 of a figure. Other draws, or a lane less, differ by tenths.
+    """
+    for index, (row, expected) in enumerate(zip(rows_of(run), rows_of(other), strict=True)):
+        tolerance = 1e-3 if index < 2 else 1e-2  # before Adam has amplified anything, and after
         for column in row:
             if column.startswith("train/"):
                 figures = [
                     float(text) if text else np.nan for text in (row[column], expected[column])
                 ]
-                np.testing.assert_allclose(*figures, rtol=1e-3, atol=1e-4, err_msg=column)
+                np.testing.assert_allclose(*figures, tolerance, tolerance / 10, err_msg=column)
     leaves, meta = checkpoint_leaves(run)
     expected, expected_meta = checkpoint_leaves(other)
     assert leaves.keys() == expected.keys()
@@ -49,7 +55,8 @@ def assert_close_training(run, other):
         if leaf.dtype.kind in "iu":  # counters and the key
             np.testing.assert_array_equal(leaves[path], leaf, err_msg=path)
         else:
-            np.testing.assert_allclose(leaves[path], leaf, rtol=1e-3, atol=1e-4, err_msg=path)
+            distance = np.linalg.norm(leaves[path] - leaf)
+            assert distance <= 0.1 * np.linalg.norm(leaf) + 1e-3, path
 
 
 def test_a_run_begun_on_four_devices_goes_on_with_one(undisturbed, tmp_path):
