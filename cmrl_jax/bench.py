@@ -26,9 +26,10 @@ from cmrl_jax.collect import init_run
 from cmrl_jax.commands import CHILD
 from cmrl_jax.config import Config, ConfigError, call_envs
 from cmrl_jax.config_io import load_config
-from cmrl_jax.metrics import package_versions
+from cmrl_jax.places import ROOT
 from cmrl_jax.replay import Transition, add
 from cmrl_jax.session import Session, prepare_jax
+from cmrl_jax.versions import package_versions
 from envs.outputs import write_json
 from envs.sawyer import ACTION_SIZE, OBS_SIZE
 
@@ -100,7 +101,7 @@ def bench_start(config: Config, report: Report) -> None:
 
 def time_to_iterations(folder: Path, name: str) -> tuple[float, float]:
     """Seconds to the end of iteration 0, and peak memory in MB by the end of iteration 1."""
-    script = Path(__file__).resolve().parent.parent / "train.py"
+    script = ROOT / "train.py"
     launch = [str(script)] if script.is_file() else ["-c", CHILD]
     command = [sys.executable, *launch, "--config", CONFIG, "--run", str(folder / name)]
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache")}

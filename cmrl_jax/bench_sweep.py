@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,11 @@ import numpy as np
 from cmrl_jax.cells import CellTable
 from cmrl_jax.commands import CHILD
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import EvalOptions
+from cmrl_jax.options import EvalOptions
+from cmrl_jax.places import ROOT
 from cmrl_jax.scores import cell_rows, of_policy
 from cmrl_jax.session import Session
+from cmrl_jax.sweep import Progress
 from cmrl_jax.targets import Target, columns_of, load_target
 from cmrl_jax.trials import trial_of
 
@@ -94,8 +95,7 @@ def time_commands(target: Target, options: EvalOptions) -> dict[str, Any]:
     Returns:
         `cells`, `seconds`.
     """
-    root = Path(__file__).resolve().parent.parent
-    paths = os.pathsep.join(p for p in (str(root), os.environ.get("PYTHONPATH")) if p)
+    paths = os.pathsep.join(p for p in (str(ROOT), os.environ.get("PYTHONPATH")) if p)
     started = 0.0
     for call in range(COMMANDS + 1):
         if call == 1:
@@ -131,3 +131,34 @@ def command_words(target: Target, options: EvalOptions, task: str) -> list[str]:
     }
     words = [w for name, x in flags.items() if x is not None for w in (f"--{name}", str(x))]
     return [*words, "--any-table"] if options.any_table else words
+
+
+def compared(
+    members: Sequence[Target],
+    options: EvalOptions,
+    table: CellTable,
+    count: int,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Times some of the cells one checkpoint and one goal at a time, beside what the sweep took."""
+    compiling = progress.compile_seconds
+    baselines = {
+        "loop": (time_one_by_one(members, options, table, count), 0.0),
+        "commands": (time_commands(members[0], options), compiling),
+    }
+    found = {}
+    for name, (taken, overhead) in baselines.items():
+        rate = taken["cells"] / taken["seconds"]
+        seconds = progress.seconds + overhead
+        swept = progress.cells / seconds if progress.cells else None
+        ratio = swept / rate if swept else None
+        found[name] = taken | {"cells_per_s": rate, "sweep_cells_per_s": swept, "ratio": ratio}
+        faster = f"the sweep is {ratio:.1f} times as fast" if ratio else "nothing was swept"
+        print(f"one by one ({name}): {taken['cells']} cells, {rate:.2f} cells/s; {faster}")
+    loop = found["loop"]
+    if progress.cells:
+        together = progress.cpu_seconds / progress.cells
+        alone = loop["cpu_seconds"] / loop["cells"]
+        print(f"processor time a cell: {together:.3f} s in the sweep, {alone:.3f} s in the loop")
+    print(f"success as in the sweep in {loop['equal_success']} of {loop['cells']} cells")
+    return found

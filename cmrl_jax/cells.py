@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from cmrl_jax.config import ConfigError
-from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.locks import lock
+from cmrl_jax.options import EvalOptions
 from envs.outputs import in_directory
 
 FIGURES = {

@@ -17,8 +17,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from cmrl_jax import evaluate_flags, finetune_flags, plot_flags, render_flags, streams
-from cmrl_jax.commands import program
+from cmrl_jax import (
+    evaluate_flags,
+    finetune_flags,
+    finetune_options,
+    plot_flags,
+    render_flags,
+    streams,
+)
+from cmrl_jax.commands import program, shown
 from cmrl_jax.config import Config, ConfigError, call_envs, leaves, suggest
 from cmrl_jax.config_io import (
     check_resumable,
@@ -30,8 +37,9 @@ from cmrl_jax.config_io import (
     run_config,
     to_yaml,
 )
-from cmrl_jax.flags import Parser, add_force, distinct, names, parse, parser_of, shown, writable
+from cmrl_jax.flags import Parser, add_force, names, parse, parser_of
 from cmrl_jax.goal_files import find_table
+from cmrl_jax.output_files import distinct, writable
 from cmrl_jax.run_dir import (
     check_unused,
     config_stem,
@@ -269,7 +277,7 @@ def _finetune(words: list[str]) -> int:
     parser = parser_of("finetune", finetune_flags.DESCRIPTION)
     args = parse(finetune_flags.add_flags(parser), words)
     options, run = finetune_flags.options_of(args), find_run(args.run)
-    finetune_flags.check_run(run_config(run), options)
+    finetune_options.check_run(run_config(run), options)
     distinct(json=args.json, figure=args.figure)
     writable(args.json, "--json", written_by("finetune"), args.force)
     if args.figure is not None:

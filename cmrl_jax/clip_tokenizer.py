@@ -10,11 +10,11 @@ import gzip
 import hashlib
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from cmrl_jax.config import ConfigError
+from cmrl_jax.places import DATA
 
-BPE_FILE = Path(__file__).parent / "data" / "bpe_simple_vocab_16e6.txt.gz"
+BPE_FILE = DATA / "bpe_simple_vocab_16e6.txt.gz"
 BPE_SHA256 = "924691ac288e54409236115652ad4aa250f48203de50a9e4722a6ecd48d6804a"
 VOCABULARY = 49408
 _BOS, _EOS = "<|startoftext|>", "<|endoftext|>"  # the last two ids

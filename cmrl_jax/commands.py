@@ -6,6 +6,7 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 SCRIPT = "cmrl"  # what the installed package is called by
 CHILD = "import sys; from cmrl_jax.cli import main; sys.exit(main())"
@@ -31,3 +32,10 @@ def command(*words: object) -> str:
 def quoted(*words: object) -> str:
     """Words of a command, each quoted where a shell needs it."""
     return shlex.join(str(word) for word in words)
+
+
+def shown(value: Any) -> str:
+    """A value as a user would type it."""
+    if isinstance(value, tuple):
+        return ",".join(str(item) for item in value)
+    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -19,6 +19,7 @@ import yaml
 
 from cmrl_jax.commands import quoted
 from cmrl_jax.config import Config, ConfigError, leaves, suggest
+from cmrl_jax.places import PACKAGE
 from cmrl_jax.validate import validate
 from cmrl_jax.yaml_tree import read_scalar, read_tree
 from envs.command_line import brief
@@ -171,7 +172,7 @@ def run_config(run: Path, acts: bool = True) -> Config:
 
 def config_dirs() -> list[Path]:
     """Where a bare `ml4.yaml` is looked for: here, configs/, the repository's, the packaged."""
-    package = Path(__file__).resolve().parent
+    package = PACKAGE
     return [Path(), Path("configs"), package.parent / "configs", package / "configs"]
 
 

@@ -40,7 +40,7 @@ class Trial:
         texts: text vector that a lane is given (policy, task, goal, G).
         first_goal: number of the first goal, by which its lanes' noise is named.
         draws: z draws a goal.
-        z: one of `evaluate_flags.Z_SOURCES`.
+        z: one of `options.Z_SOURCES`.
         deterministic: whether actions are the tanh of the mean.
     """
 

@@ -8,7 +8,7 @@ from typing import Any
 from cmrl_jax.cells import CellTable, Row
 from cmrl_jax.config import call_envs
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
+from cmrl_jax.options import EvalOptions, evaluated_tasks
 from cmrl_jax.scores import cell_rows, format_scores, of_policy, summarise
 from cmrl_jax.session import Session, load_policy, prepare_jax
 from cmrl_jax.settings import describe, result_fields, row_columns

@@ -31,9 +31,9 @@ from cmrl_jax.cells import Row
 from cmrl_jax.config import ConfigError
 from cmrl_jax.episode import Episode
 from cmrl_jax.evaluate import Trial, lane_names
-from cmrl_jax.evaluate_flags import EvalOptions, evaluated_tasks
+from cmrl_jax.formats import format_duration
 from cmrl_jax.metaworld_agent import MetaWorldAgent
-from cmrl_jax.metrics import format_duration
+from cmrl_jax.options import EvalOptions, evaluated_tasks
 from cmrl_jax.scores import cell_rows, format_scores, summarise
 from cmrl_jax.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.settings import describe, horizon_of, result_fields, row_columns

@@ -31,7 +31,7 @@ from cmrl_jax.context import (
 )
 from cmrl_jax.distributions import Gaussian
 from cmrl_jax.episode import Episode, Lanes, PolicyParams, ZSource, make_episode
-from cmrl_jax.finetune_flags import FinetuneOptions
+from cmrl_jax.finetune_options import FinetuneOptions
 from cmrl_jax.learner import Learner, TrainState, make_learner
 from cmrl_jax.optimizers import init_adam
 from cmrl_jax.replay import ReplayState, stored_transitions
@@ -75,7 +75,7 @@ def finetune_config(
 
     Args:
         config: the run's own.
-        adapt: see `finetune_flags.ADAPT`.
+        adapt: see `finetune_options.ADAPT`.
         updates: gradient steps per control step.
         denominator: what rewards are divided by.
 
@@ -216,7 +216,7 @@ class FineTuning:
 
     Args:
         config: of `finetune_config`, for the way and its task.
-        adapt: one of `finetune_flags.ADAPT`.
+        adapt: one of `finetune_options.ADAPT`.
         text: text vector of the task (G,).
     """
 

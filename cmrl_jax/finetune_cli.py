@@ -20,12 +20,12 @@ from cmrl_jax.finetune import (
     finetune_config,
     training_denominator,
 )
-from cmrl_jax.finetune_flags import FinetuneOptions, check_run
+from cmrl_jax.finetune_options import FinetuneOptions, check_run
 from cmrl_jax.goals import check_same_table, load_goals
 from cmrl_jax.learner import TrainState
-from cmrl_jax.metrics import package_versions
 from cmrl_jax.scores import fault_warning
 from cmrl_jax.session import Session, prepare_jax
+from cmrl_jax.versions import package_versions
 from envs.outputs import write_json
 
 Curves = dict[str, dict[int, Score]]

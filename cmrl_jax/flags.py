@@ -8,16 +8,13 @@ and a user's mistake are answered at once.
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
 
 from cmrl_jax.commands import program
 from cmrl_jax.config import MOST_EPISODES, MOST_STEPS, ConfigError, call_envs, suggest
 from envs.command_line import Parser, whole
 from envs.goal_names import GOALS, LARGEST_SEED
-from envs.outputs import FORCE_HELP, check_output
+from envs.outputs import FORCE_HELP
 
 
 def parser_of(command: str, description: str) -> Parser:
@@ -55,39 +52,6 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(item.strip() for item in text.split(",") if item.strip())
 
 
-def shown(value: Any) -> str:
-    """A value as a user would type it."""
-    if isinstance(value, tuple):
-        return ",".join(str(item) for item in value)
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Adds `--force`, which every command that writes output files has."""
     parser.add_argument("--force", action="store_true", help=FORCE_HELP)
-
-
-def writable(path: Path | None, flag: str, mark: str, force: bool) -> None:
-    """Whether an output file may be written; see `envs.outputs.check_output`.
-
-    Raises:
-        ConfigError: it may not, or cannot.
-    """
-    if path is not None:
-        call_envs(lambda: check_output(path, flag, mark, force))
-
-
-def distinct(**paths: Path | None) -> None:
-    """Whether output files are different ones, by the names of their flags.
-
-    Raises:
-        ConfigError: two are one file, of which the second would take the place of the first.
-    """
-    seen: dict[str, str] = {}
-    for name, path in paths.items():
-        if path is None:
-            continue
-        other = seen.setdefault(os.path.realpath(path), name)
-        if other != name:
-            cause = f"--{other} and --{name} are one file, {path}"
-            raise ConfigError(cause, f"give --{name} a file of its own")

@@ -12,9 +12,9 @@ import numpy as np
 
 from cmrl_jax.config import TEXT_ENCODERS, ConfigError, call_envs
 from cmrl_jax.encoders import Encoder, file_sha256, find_encoder
-from cmrl_jax.flags import writable
 from cmrl_jax.goal_files import PROMPTS_FILE, table_path
 from cmrl_jax.goals import GoalTable, read_table
+from cmrl_jax.output_files import writable
 from cmrl_jax.yaml_tree import read_tree
 from envs.npz import write_npz
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from cmrl_jax.commands import command
 from cmrl_jax.config import GOAL_ABLATIONS, TEXT_ENCODERS, ConfigError, call_envs
+from cmrl_jax.places import DATA
 from cmrl_jax.validate import check_goal_table
 from envs.command_line import brief, what_is
 
-DATA = Path(__file__).parent / "data"
 PROMPTS_FILE = DATA / "goal_prompts.yaml"
 DEFAULT_TABLE = TEXT_ENCODERS[0]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from cmrl_jax.flags import distinct
+from cmrl_jax.output_files import distinct
 from envs.command_line import typed_path
 from envs.outputs import FORCE_HELP
 

@@ -17,9 +17,9 @@ from cmrl_jax.config_io import run_config
 from cmrl_jax.distributions import Gaussian, kl_to_standard_normal
 from cmrl_jax.episode import Lanes, PolicyParams, lane_noise, noise_key
 from cmrl_jax.evaluate import Evaluator, Trial
-from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.inspection_file import Inspection, Latents, Usage, write_inspection
 from cmrl_jax.networks import Routing
+from cmrl_jax.options import EvalOptions
 from cmrl_jax.rollout import rollout
 from cmrl_jax.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.settings import result_fields

@@ -1,4 +1,4 @@
-"""Where a run's figures go: metrics.csv, the console, TensorBoard, versions.json.
+"""Where a run's figures go: metrics.csv, the console, TensorBoard.
 
 Every figure is written as the shortest text that is exact in float32, so two equal runs give equal
 files byte for byte; what is not a function of config and seed is named `wall_s` or `time/...`.
@@ -7,57 +7,23 @@ files byte for byte; what is not a function of config and seed is named `wall_s`
 from __future__ import annotations
 
 import csv
-import datetime
-import importlib.metadata
-import json
 import os
-import platform
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-import jax
 import numpy as np
 
 from cmrl_jax.config import ConfigError
-from cmrl_jax.run_dir import write_text
+from cmrl_jax.formats import format_duration, format_figure
 from cmrl_jax.streams import Output
 
 LEADING_COLUMNS = ("iteration", "env_steps", "gradient_steps", "wall_s", "seed")
-PACKAGES = (
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "brax",
-    "mujoco",
-    "mujoco-mjx",
-    "metaworld",
-    "numpy",
-)
 
 Row = Mapping[str, Any]
-
-
-def format_figure(value: Any) -> str:
-    """A number (Python, numpy or jax scalar) as CSV text; None is empty.
-
-    Integers are exact, floats the shortest text that reads back to the same float32.
-    """
-    if value is None:
-        return ""
-    number = np.asarray(value)
-    if number.shape != () or number.dtype.kind not in "biuf":
-        raise TypeError(f"a figure is one number, got {value!r}")
-    if number.dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            return str(np.float32(number))
-    return str(int(number))
 
 
 class MetricsCsv:
@@ -202,17 +168,6 @@ class TensorBoard:
         self._writer.close()
 
 
-def format_duration(seconds: float) -> str:
-    """`42s`, `3m07s`, `2h05m`; `?` where it is not known."""
-    if not np.isfinite(seconds):
-        return "?"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours}h{minutes:02d}m"
-    return f"{minutes}m{rest:02d}s" if minutes else f"{rest}s"
-
-
 def figure_of(row: Row, name: str, tasks: Iterable[str]) -> float | None:
     """`train/<name>`, or else the mean of `train/<task>/<name>` over the tasks that have it."""
     if row.get(f"train/{name}") is not None:
@@ -312,42 +267,3 @@ class Console:
     def close(self) -> None:
         if self._progress is not None:
             self._progress.stop()
-
-
-def package_versions() -> dict[str, str | None]:
-    """Versions that a checkpoint's or a result's numbers may depend on; None: not installed."""
-    versions: dict[str, str | None] = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
-    return versions
-
-
-def git_commit(root: Path | None = None) -> str | None:
-    """The commit of the source tree, marked `-dirty` if tracked files changed; None without git."""
-    root = root or Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():  # an installed wheel must not report the repository around it
-        return None
-    options = ["--always", "--dirty", "--abbrev=40", "--exclude=*"]  # the hash, never a tag
-    command = ["git", "-C", str(root), "describe", *options]
-    try:
-        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return found.stdout.strip() or None
-
-
-def write_versions(path: Path) -> dict[str, Any]:
-    """Write versions.json: packages, commit, device, processors and date; returns what it holds."""
-    device = jax.devices()[0]
-    versions = package_versions() | {
-        "commit": git_commit(),
-        "device": f"{device.platform}: {device.device_kind}",
-        "device_count": jax.device_count(),
-        "cpu_count": os.cpu_count(),
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    }
-    write_text(path, json.dumps(versions, indent=2) + "\n")
-    return versions

@@ -19,9 +19,9 @@ import numpy as np
 
 from cmrl_jax.config import Config, ConfigError, as_config_error
 from cmrl_jax.config_io import run_config
-from cmrl_jax.flags import writable
 from cmrl_jax.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.inspection_file import read_inspection
+from cmrl_jax.output_files import writable
 from cmrl_jax.run_files import (
     EVALUATION,
     Curve,

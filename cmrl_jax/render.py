@@ -16,8 +16,8 @@ import numpy as np
 
 from cmrl_jax.config import as_config_error
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.film import Camera, Episode, Film, write_sheet, write_video
+from cmrl_jax.options import EvalOptions
 from cmrl_jax.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.trials import evaluation_config, trial_of
 from envs.native import unpack

@@ -8,7 +8,8 @@ from typing import Any
 
 from cmrl_jax.config import ConfigError, call_envs
 from cmrl_jax.config_io import run_config
-from cmrl_jax.flags import add_force, episodes, goal_index, natural, seed, steps, writable
+from cmrl_jax.flags import add_force, episodes, goal_index, natural, seed, steps
+from cmrl_jax.output_files import writable
 from cmrl_jax.run_dir import find_run
 from cmrl_jax.validate import check_goal_set
 from envs.command_line import make_directory, typed_path, whole

@@ -14,7 +14,7 @@ import numpy as np
 
 from cmrl_jax.cells import FIGURES, Row, as_text
 from cmrl_jax.episode import Episode
-from cmrl_jax.metrics import format_figure
+from cmrl_jax.formats import format_figure
 
 RESAMPLES = 2000
 

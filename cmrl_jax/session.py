@@ -23,7 +23,7 @@ from cmrl_jax.evaluate import Evaluator, Trial
 from cmrl_jax.goals import GoalTable, load_goals
 from cmrl_jax.jax_runtime import cache_directory, check_switches, first_device
 from cmrl_jax.learner import Learner, TrainState, make_learner
-from cmrl_jax.metrics import package_versions
+from cmrl_jax.versions import package_versions
 from envs.goal_sets import load_goal_set
 from envs.sawyer import Ml4Env
 

@@ -10,9 +10,9 @@ from cmrl_jax.cells import RENAMED, UNNAMED
 from cmrl_jax.checkpoint import policy_digest
 from cmrl_jax.config import TASKS, Config
 from cmrl_jax.controls import other_task
-from cmrl_jax.evaluate_flags import DONATED, EvalOptions, evaluated_tasks
 from cmrl_jax.goals import load_goals
-from cmrl_jax.metrics import package_versions
+from cmrl_jax.options import DONATED, EvalOptions, evaluated_tasks
+from cmrl_jax.versions import package_versions
 
 
 def horizon_of(options: EvalOptions, config: Config) -> int:

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
 
-from cmrl_jax.bench_sweep import time_commands, time_one_by_one
 from cmrl_jax.cells import CellTable
 from cmrl_jax.config import TASKS, call_envs
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import DONATED, EvalOptions
-from cmrl_jax.metrics import format_duration
+from cmrl_jax.formats import format_duration
+from cmrl_jax.options import DONATED, EvalOptions
 from cmrl_jax.scores import cell_rows, fault_warning, of_policy, summarise_rows
 from cmrl_jax.session import Policy, Session, prepare_jax
 from cmrl_jax.settings import result_fields, row_columns
@@ -61,19 +60,23 @@ class Progress:
         return f"{self.cells:>8,} of {self.total:,} cells | {rate:,.1f} cells/s | ETA {left}"
 
 
+# Checkpoints that share a program, the table with their cells, what they took -> figures.
+Compare = Callable[[Sequence[Target], CellTable, Progress], dict[str, Any]]
+
+
 def sweep(
     runs: Sequence[Path],
     checkpoints: tuple[int, ...] | Literal["all", "last"],
     options: EvalOptions,
     json_path: Path | None,
     csv_path: Path | None,
-    compare: int,
+    compare: Compare | None,
     force: bool,
 ) -> int:
     """Scores the checkpoints, prints a table, writes JSON and CSV; returns the exit code.
 
     Args:
-        compare: adaptation runs that are timed one at a time, too; 0 for none.
+        compare: measures the first group by other means, too.
         force: begin a CSV anew that is no table of cells.
 
     Raises:
@@ -93,8 +96,8 @@ def sweep(
             for _, group in itertools.groupby(sorted(targets, key=program_key), program_key):
                 members = list(group)
                 evaluate_group({t: todo[t] for t in members if todo[t]}, options, table, progress)
-                if compare and comparison is None:
-                    comparison = compared(members, options, table, compare, progress)
+                if compare is not None and comparison is None:
+                    comparison = compare(members, table, progress)
         except (KeyboardInterrupt, jax.errors.JaxRuntimeError) as error:
             if not is_interrupt(error):
                 raise
@@ -189,37 +192,6 @@ def run_batch(
         table.add(rows)
         progress.cells += len(rows)
     print(progress.line(), flush=True)
-
-
-def compared(
-    members: Sequence[Target],
-    options: EvalOptions,
-    table: CellTable,
-    count: int,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Times some of the cells one checkpoint and one goal at a time, beside what the sweep took."""
-    compiling = progress.compile_seconds
-    baselines = {
-        "loop": (time_one_by_one(members, options, table, count), 0.0),
-        "commands": (time_commands(members[0], options), compiling),
-    }
-    found = {}
-    for name, (taken, overhead) in baselines.items():
-        rate = taken["cells"] / taken["seconds"]
-        seconds = progress.seconds + overhead
-        swept = progress.cells / seconds if progress.cells else None
-        ratio = swept / rate if swept else None
-        found[name] = taken | {"cells_per_s": rate, "sweep_cells_per_s": swept, "ratio": ratio}
-        faster = f"the sweep is {ratio:.1f} times as fast" if ratio else "nothing was swept"
-        print(f"one by one ({name}): {taken['cells']} cells, {rate:.2f} cells/s; {faster}")
-    loop = found["loop"]
-    if progress.cells:
-        together = progress.cpu_seconds / progress.cells
-        alone = loop["cpu_seconds"] / loop["cells"]
-        print(f"processor time a cell: {together:.3f} s in the sweep, {alone:.3f} s in the loop")
-    print(f"success as in the sweep in {loop['equal_success']} of {loop['cells']} cells")
-    return found
 
 
 def evaluation_of(target: Target, options: EvalOptions, table: CellTable) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from cmrl_jax.cells import CellTable
 from cmrl_jax.checkpoint import policy_store
 from cmrl_jax.config import TASKS, Config, ConfigError, leaves
-from cmrl_jax.evaluate_flags import DONATED, EvalOptions, evaluated_tasks
+from cmrl_jax.options import DONATED, EvalOptions, evaluated_tasks
 from cmrl_jax.session import Policy, Session, load_policy
 from cmrl_jax.settings import cell_columns, settings
 from cmrl_jax.trials import evaluation_config

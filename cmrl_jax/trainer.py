@@ -28,17 +28,15 @@ from cmrl_jax.collect import (
 )
 from cmrl_jax.commands import command
 from cmrl_jax.config import Config, ConfigError, lanes_per_task
+from cmrl_jax.formats import format_duration
 from cmrl_jax.goals import check_same_table
 from cmrl_jax.metrics import (
     LEADING_COLUMNS,
     Console,
     MetricsCsv,
     TensorBoard,
-    format_duration,
     format_evaluation,
     format_iteration,
-    package_versions,
-    write_versions,
 )
 from cmrl_jax.run_dir import write_text
 from cmrl_jax.scores import fault_warning, format_scores, of_policy, summarise
@@ -46,6 +44,7 @@ from cmrl_jax.session import Session, policy_params, prepare_jax
 from cmrl_jax.stop import StopSignal
 from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
 from cmrl_jax.validate import check_devices
+from cmrl_jax.versions import package_versions, write_versions
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
 

@@ -15,8 +15,8 @@ from cmrl_jax.config import Config, ConfigError
 from cmrl_jax.config_io import run_config
 from cmrl_jax.controls import other_task, text_per_goal
 from cmrl_jax.evaluate import Trial
-from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.goals import GoalTable, load_goals
+from cmrl_jax.options import EvalOptions
 from cmrl_jax.session import Policy, Session
 
 LANES = {"cpu": 256}

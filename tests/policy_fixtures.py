@@ -11,9 +11,9 @@ import numpy as np
 from cmrl_jax.checkpoint import policy_store
 from cmrl_jax.config_io import load_config, to_yaml
 from cmrl_jax.episode import PolicyParams
-from cmrl_jax.metrics import package_versions
 from cmrl_jax.normalizers import init_obs_stats
 from cmrl_jax.session import Session, policy_params
+from cmrl_jax.versions import package_versions
 from envs.sawyer import Ml4Env
 
 HORIZON = 6

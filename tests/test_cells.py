@@ -10,7 +10,7 @@ from policy_fixtures import small_config
 
 from cmrl_jax.cells import CELL, COLUMNS, FIGURES, RENAMED, SETTINGS, UNNAMED, CellTable
 from cmrl_jax.config import ConfigError
-from cmrl_jax.evaluate_flags import EvalOptions
+from cmrl_jax.options import EvalOptions
 from cmrl_jax.settings import settings
 
 OPTIONS = EvalOptions(horizon=200, physics="native")

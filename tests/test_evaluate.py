@@ -10,7 +10,7 @@ from policy_fixtures import HORIZON, MovingEnv, random_policy, small_config
 
 from cmrl_jax.controls import donors
 from cmrl_jax.evaluate import Evaluator, Trial, lane_names
-from cmrl_jax.evaluate_flags import MOST_DRAWS
+from cmrl_jax.options import MOST_DRAWS
 from cmrl_jax.replay import Transition
 from cmrl_jax.session import Session
 from envs.goal_names import GOALS

@@ -9,7 +9,7 @@ import pytest
 import cmrl_jax
 from cmrl_jax.cli import main
 from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.evaluate_flags import EvalOptions
+from cmrl_jax.options import EvalOptions
 from envs.outputs import write_json
 
 

@@ -18,9 +18,9 @@ from cmrl_jax.checkpoint import policy_store
 from cmrl_jax.config_io import load_config, to_yaml
 from cmrl_jax.evaluate import Evaluator
 from cmrl_jax.film import HEIGHT, STRIP, WIDTH, Episode
-from cmrl_jax.metrics import package_versions
 from cmrl_jax.render import FilmedEnv, film_run
 from cmrl_jax.session import Policy, Session, policy_params
+from cmrl_jax.versions import package_versions
 from envs.goal_sets import load_goal_set
 from envs.reference import record_rollout
 from envs.tasks import TASKS

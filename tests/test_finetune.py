@@ -24,7 +24,7 @@ from cmrl_jax.finetune import (
     restrict,
     start_state,
 )
-from cmrl_jax.finetune_flags import ADAPT, FinetuneOptions, check_run
+from cmrl_jax.finetune_options import ADAPT, FinetuneOptions, check_run
 from cmrl_jax.goals import load_goals
 from cmrl_jax.learner import make_learner
 from cmrl_jax.replay import ContextBatch

@@ -16,7 +16,6 @@ from policy_fixtures import HORIZON, random_policy, save_run, small_config
 from cmrl_jax import evaluate_metaworld
 from cmrl_jax.cli import main
 from cmrl_jax.evaluate import Evaluator, lane_names
-from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.evaluate_metaworld import (
     adaptation_run,
     agent_of,
@@ -26,6 +25,7 @@ from cmrl_jax.evaluate_metaworld import (
     of_task,
 )
 from cmrl_jax.metaworld_agent import MetaWorldAgent
+from cmrl_jax.options import EvalOptions
 from cmrl_jax.replay import Transition
 from cmrl_jax.session import Policy, Session
 from envs.metaworld_envs import make_vector_env, set_goals

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from run_helpers import csv_points, tensorboard_points
 
-from cmrl_jax import metrics
+from cmrl_jax import formats, metrics, versions
 from cmrl_jax.config import ConfigError
 
 COLUMNS = (*metrics.LEADING_COLUMNS, "train/critic_loss", "eval/drawer-open/k0/success_any")
@@ -41,21 +41,21 @@ def make_row(iteration: int, **figures: object) -> dict[str, object]:
     ],
 )
 def test_figures_are_the_shortest_exact_text(value: object, text: str):
-    assert metrics.format_figure(value) == text
+    assert formats.format_figure(value) == text
 
 
 def test_every_float32_reads_back_as_itself():
     bits = np.random.default_rng(0).integers(0, 2**32, 5000, dtype=np.uint32)
     values = bits.view(np.float32)
     values = values[np.isfinite(values)]
-    back = np.array([np.float32(metrics.format_figure(v)) for v in values])
+    back = np.array([np.float32(formats.format_figure(v)) for v in values])
     np.testing.assert_array_equal(back, values)
 
 
 @pytest.mark.parametrize("value", ["0.1", np.zeros(2), 1j])
 def test_what_is_not_one_number_is_refused(value: object):
     with pytest.raises(TypeError, match="one number"):
-        metrics.format_figure(value)
+        formats.format_figure(value)
 
 
 def test_rows_are_written_at_once_and_empty_where_nothing_was_taken(tmp_path):
@@ -177,7 +177,7 @@ def test_missing_tensorboard_names_its_cure(tmp_path, monkeypatch):
     [(0, "0s"), (59.4, "59s"), (59.6, "1m00s"), (187, "3m07s"), (7500, "2h05m"), (math.inf, "?")],
 )
 def test_durations(seconds: float, text: str):
-    assert metrics.format_duration(seconds) == text
+    assert formats.format_duration(seconds) == text
 
 
 def test_the_console_line_shows_each_figure_once():
@@ -238,7 +238,7 @@ def test_a_progress_bar_is_drawn_on_a_terminal_only():
 
 def test_versions_name_everything_a_result_depends_on(tmp_path):
     path = tmp_path / "versions.json"
-    written = metrics.write_versions(path)
+    written = versions.write_versions(path)
     found = json.loads(path.read_text())
     assert found == written
     assert found["jax"] == jax.__version__ and found["numpy"] == np.__version__
@@ -251,7 +251,7 @@ def test_versions_name_everything_a_result_depends_on(tmp_path):
 
 def test_a_missing_package_has_no_version(monkeypatch):
     monkeypatch.setattr(metrics, "PACKAGES", ("jax", "no-such-package-here"))
-    assert metrics.package_versions()["no-such-package-here"] is None
+    assert versions.package_versions()["no-such-package-here"] is None
 
 
 def test_the_commit_is_that_of_the_tree_itself(tmp_path):
@@ -266,9 +266,9 @@ def test_the_commit_is_that_of_the_tree_itself(tmp_path):
     git("commit", "-q", "-m", "first")
     git("tag", "-a", "v1", "-m", "a tag")
     commit = git("rev-parse", "HEAD")
-    assert metrics.git_commit(tmp_path) == commit
+    assert versions.git_commit(tmp_path) == commit
     (tmp_path / "file").write_text("two")
-    assert metrics.git_commit(tmp_path) == f"{commit}-dirty"
+    assert versions.git_commit(tmp_path) == f"{commit}-dirty"
     inside = tmp_path / "site-packages"
     inside.mkdir()
-    assert metrics.git_commit(inside) is None
+    assert versions.git_commit(inside) is None

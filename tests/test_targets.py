@@ -12,8 +12,8 @@ from policy_fixtures import random_policy, save_run, small_config
 
 from cmrl_jax.config import Config, leaves
 from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import EvalOptions
 from cmrl_jax.goal_files import table_path
+from cmrl_jax.options import EvalOptions
 from cmrl_jax.session import Session
 from cmrl_jax.targets import IDLE, Target, columns_of, program_key, targets_of
 from cmrl_jax.trials import Plan, fitted, plan_batches

@@ -12,7 +12,7 @@ from policy_fixtures import random_policy, small_config
 import cmrl_jax
 from cmrl_jax.config import ConfigError
 from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.evaluate_flags import EvalOptions, check_run
+from cmrl_jax.options import EvalOptions, check_run
 from cmrl_jax.session import Policy, Session
 from cmrl_jax.trials import batch_lanes, evaluation_config, trial_of
 
