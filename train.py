@@ -17,7 +17,7 @@ def start():
     import importlib.util
 
     try:
-        from cmrl_jax.cli import main
+        from cmrl_jax.cli.main import main
 
         return main()
     except ModuleNotFoundError as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 SCRIPT = "cmrl"  # what the installed package is called by
-CHILD = "import sys; from cmrl_jax.cli import main; sys.exit(main())"
+CHILD = "import sys; from cmrl_jax.cli.main import main; sys.exit(main())"
 """The program for a process of its own, `python -c CHILD WORD ...`, installed or not."""
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from cmrl_jax.config import ConfigError
+from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.streams import to_stderr
 
 ALLOWED = (None, "allow", "log", "log_explicit")

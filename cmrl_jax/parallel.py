@@ -45,7 +45,7 @@ def split(tree: Any, axis: int = 0) -> Any:
     """The arrays of a traced tree with one axis split over the devices.
 
     Args:
-        axis: its length is divisible by their number (`validate.check_devices`).
+        axis: its length is divisible by their number (`rules.check_devices`).
     """
     return _constrain(tree, PartitionSpec(*[None] * axis, AXIS))
 

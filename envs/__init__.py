@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from envs.brax_view import SingleTaskEnv
+    from envs.adapters.brax_view import SingleTaskEnv
     from envs.sawyer import Ml4Env, State
     from envs.tasks import TASKS
 
@@ -22,12 +22,12 @@ _HOME = {"TASKS": "envs.tasks", "Ml4Env": "envs.sawyer", "State": "envs.sawyer"}
 def make(
     task: str, horizon: int = 200, goal_observable: bool = False, auto_reset: bool = True
 ) -> SingleTaskEnv:
-    """One task as a brax environment; see `envs.brax_view.SingleTaskEnv` for the arguments.
+    """One task as a brax environment; see `SingleTaskEnv` for the arguments.
 
     Raises:
         ValueError: unknown task, or a horizon below one step.
     """
-    from envs.brax_view import SingleTaskEnv
+    from envs.adapters.brax_view import SingleTaskEnv
 
     return SingleTaskEnv(task, horizon, goal_observable, auto_reset)
 

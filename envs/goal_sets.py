@@ -29,6 +29,7 @@ from envs.command_line import Parser, run, typed_path
 from envs.goal_names import GOALS, SEEDS, seed_of
 from envs.npz import write_npz
 from envs.outputs import FORCE_HELP, check_output
+from envs.places import DATA
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 
@@ -40,7 +41,7 @@ RESET_BOX = {
 }
 """Lowest and highest fixture position (m) of each task; Meta-World's `_random_reset_space`."""
 
-_PACKAGED = Path(__file__).parent / "data" / "goal_sets.npz"
+_PACKAGED = DATA / "goal_sets.npz"
 _CACHE_VARIABLE = "CMRL_JAX_CACHE"
 
 

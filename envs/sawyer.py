@@ -16,7 +16,8 @@ import numpy as np
 from flax import struct
 
 from envs import rewards
-from envs.physics import Physics, Positions, make_physics, settled_starts
+from envs.physics.backends import make_physics
+from envs.physics.base import Physics, Positions, settled_starts
 from envs.tasks import (
     HAND_HIGH,
     HAND_LOW,
@@ -72,7 +73,7 @@ class Ml4Env:
 
     Args:
         goal_observable: show the target in the last three observation numbers.
-        physics: backend, one of `physics.BACKENDS`.
+        physics: backend, one of `physics.backends.BACKENDS`.
         obs_mode: `metaworld`, or `canonical`, see `canonical_obs`.
 
     Raises:

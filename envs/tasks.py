@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.model import SCENES
+from envs.physics.model import SCENES
 
 HAND_LOW, HAND_HIGH = (-0.5, 0.40, 0.05), (0.5, 1.0, 0.5)  # mocap box, and clip of a shown goal
 OBS_HAND_LOW, OBS_HAND_HIGH = (-0.525, 0.348, -0.0525), (0.525, 1.025, 0.7)

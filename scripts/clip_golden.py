@@ -51,7 +51,7 @@ def outputs(name: str) -> dict[str, np.ndarray]:
 
 def difference(name: str, data: Mapping[str, np.ndarray]) -> float:
     """The largest difference of cmrl_jax's tower to torch's vectors, as `outputs` returns them."""
-    from cmrl_jax.clip_text import Architecture, text_vectors, to_params
+    from cmrl_jax.text.clip_text import Architecture, text_vectors, to_params
 
     config = cases.ARCHITECTURES[name]
     tensors = cases.random_tensors(config)

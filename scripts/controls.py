@@ -16,9 +16,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
-from cmrl_jax.config import Config, ConfigError  # noqa: E402
-from cmrl_jax.config_io import run_config  # noqa: E402
-from cmrl_jax.run_files import EVALUATION, read_evaluation  # noqa: E402
+from cmrl_jax.config.files import run_config  # noqa: E402
+from cmrl_jax.config.schema import Config, ConfigError  # noqa: E402
+from cmrl_jax.storage.run_files import EVALUATION, read_evaluation  # noqa: E402
 from scripts.experiments import RESULTS, RUNS, refused  # noqa: E402
 
 CONTROLS = {

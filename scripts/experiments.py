@@ -20,9 +20,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
-from cmrl_jax.config import ConfigError  # noqa: E402
-from cmrl_jax.documents import read_csv  # noqa: E402
-from cmrl_jax.run_files import EVALUATION, METRICS, read_evaluation  # noqa: E402
+from cmrl_jax.config.schema import ConfigError  # noqa: E402
+from cmrl_jax.storage.documents import read_csv  # noqa: E402
+from cmrl_jax.storage.run_files import EVALUATION, METRICS, read_evaluation  # noqa: E402
 
 RUNS, RESULTS = Path("runs/experiments"), Path("results")
 CSV_ROWS = 100  # kept of a run's metrics

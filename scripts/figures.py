@@ -13,11 +13,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
-from cmrl_jax.config import TASKS, ConfigError  # noqa: E402
-from cmrl_jax.config_io import run_config  # noqa: E402
-from cmrl_jax.inspection_file import FILE as INSPECTION  # noqa: E402
-from cmrl_jax.plots import plot_adaptation, plot_inspections, plot_learning  # noqa: E402
-from cmrl_jax.run_files import (  # noqa: E402
+from cmrl_jax.analysis.inspection_file import FILE as INSPECTION  # noqa: E402
+from cmrl_jax.analysis.plots import plot_adaptation, plot_inspections, plot_learning  # noqa: E402
+from cmrl_jax.config.files import run_config  # noqa: E402
+from cmrl_jax.config.schema import TASKS, ConfigError  # noqa: E402
+from cmrl_jax.storage.run_files import (  # noqa: E402
     EVALUATION,
     METRICS,
     Row,

@@ -17,8 +17,8 @@ import optax
 from scipy.spatial import ConvexHull
 
 from envs.engine import mujoco
-from envs.geometry import BASE_FILE
-from envs.model import load_scene
+from envs.physics.mjx.geometry import BASE_FILE
+from envs.physics.model import load_scene
 
 MERGE_ANGLE, SIDE_MERGE_ANGLE = np.radians(22), np.radians(15)
 HANDLE_RADIUS, PROBES, STEPS = 0.008, 6000, 4000

@@ -26,7 +26,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]  # this working tree, whatever is installed
 
-from cmrl_jax.flags import natural, seed  # noqa: E402
+from cmrl_jax.cli.flags import natural, seed  # noqa: E402
 from envs.command_line import typed_path, whole  # noqa: E402
 
 STEPS = 600  # env steps of an iteration of smoke.yaml
@@ -127,7 +127,7 @@ def unreadable(run: Path) -> list[str]:
     """What is in a run directory that is neither a file of the design nor a sound checkpoint."""
     from run_helpers import checkpoint_leaves
 
-    from cmrl_jax.manifest import find_damage
+    from cmrl_jax.storage.manifest import find_damage
 
     expected = {"config.yaml", "versions.json", "metrics.csv", "eval.json", "ckpt", "policy"}
     found = [path.name for path in run.iterdir() if path.name not in expected | {".lock"}]

@@ -10,8 +10,9 @@ import optax
 import pytest
 from flax import struct
 
-from cmrl_jax import checkpoint, config_io, manifest
-from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config import files as config_io
+from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.storage import checkpoint, manifest
 
 
 @struct.dataclass

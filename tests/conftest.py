@@ -3,12 +3,14 @@
 Set before jax is imported, as environment variables, so that subprocesses of tests have them too.
 """
 
+import importlib
 import os
+import sys
 from pathlib import Path
 
 import pytest
 
-from cmrl_jax.cli import main  # imports neither jax nor mujoco
+from cmrl_jax.cli.main import main  # imports neither jax nor mujoco
 
 CACHE = Path(__file__).resolve().parent.parent / ".cache" / "jax-tests"
 
@@ -30,6 +32,18 @@ def refused(capsys):
         return lines[0].removeprefix("error: "), lines[1].removeprefix("fix: ")
 
     return run
+
+
+@pytest.fixture
+def replace_module(monkeypatch):
+    """Puts another object in the place of a module that is imported when it is needed."""
+
+    def replace(name: str, fake: object) -> None:
+        package, _, leaf = name.rpartition(".")
+        monkeypatch.setitem(sys.modules, name, fake)
+        monkeypatch.setattr(importlib.import_module(package), leaf, fake, raising=False)
+
+    return replace
 
 
 # Imported when asked for, since metaworld and mjx take seconds.
@@ -58,7 +72,7 @@ def gl():
     MuJoCo takes its GL from the environment when it is imported, so pictures need processes of
     their own.
     """
-    from envs.render import choose_gl
+    from envs.render.frames import choose_gl
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))  # put back afterwards

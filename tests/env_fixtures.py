@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from envs.goal_sets import load_goal_set
-from envs.parity_parts import Port
-from envs.reference import Rollout, record_rollout
+from envs.parity.parts import Port
+from envs.parity.reference import Rollout, record_rollout
 from envs.sawyer import Ml4Env
 from envs.tasks import TASKS
 

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from cmrl_jax import parallel, replay
-from cmrl_jax.collect import init_run, make_train_iteration
-from cmrl_jax.config_io import load_config
-from cmrl_jax.session import Session
+from cmrl_jax import parallel
+from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
+from cmrl_jax.algorithms.common import replay
+from cmrl_jax.config.files import load_config
+from cmrl_jax.evaluation.session import Session
 
 TASKS, LANES, CAPACITY, OBS = 3, 4, 24, 2
 

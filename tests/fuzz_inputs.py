@@ -8,11 +8,11 @@ from pathlib import Path
 import yaml
 from hypothesis import strategies as st
 
-from cmrl_jax import cli
-from cmrl_jax.config import Config, leaves
-from cmrl_jax.config_io import to_dict
+from cmrl_jax.cli import main as cli
+from cmrl_jax.config.files import to_dict
+from cmrl_jax.config.schema import Config, leaves
 
-ROOT = Path(cli.__file__).parents[1]
+ROOT = Path(cli.__file__).parents[2]
 CONFIGS = sorted(path.read_text() for path in ROOT.glob("configs/*.yaml"))
 DEFAULTS = {name: value for name, _, value in leaves(Config())}
 SECTIONS = [key for key, value in to_dict(Config()).items() if isinstance(value, dict)]

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.checkpoint import policy_store
-from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.episode import PolicyParams
-from cmrl_jax.normalizers import init_obs_stats
-from cmrl_jax.session import Session, policy_params
-from cmrl_jax.versions import package_versions
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.evaluation.episode import PolicyParams
+from cmrl_jax.evaluation.session import Session, policy_params
+from cmrl_jax.nn.normalizers import init_obs_stats
+from cmrl_jax.storage.checkpoint import policy_store
+from cmrl_jax.storage.versions import package_versions
 from envs.sawyer import Ml4Env
 
 HORIZON = 6

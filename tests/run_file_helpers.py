@@ -2,7 +2,7 @@
 
 import json
 
-from cmrl_jax.config_io import load_config, to_yaml
+from cmrl_jax.config.files import load_config, to_yaml
 
 CSV = """iteration,env_steps,train/window-open/success_any,eval/window-open/k0/success_any
 0,100,0.0,

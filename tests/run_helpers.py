@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.checkpoint import full_store, policy_store, split_run
-from cmrl_jax.cli import main
-from cmrl_jax.collect import init_run
-from cmrl_jax.config_io import load_config
-from cmrl_jax.session import Session
+from cmrl_jax.algorithms.cmrl.collect import init_run
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config
+from cmrl_jax.evaluation.session import Session
+from cmrl_jax.storage.checkpoint import full_store, policy_store, split_run
 
 ROOT = Path(__file__).resolve().parent.parent
 TRAIN = (sys.executable, str(ROOT / "train.py"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs.mjx_physics import MjxPhysics
+from envs.physics.mjx.backend import MjxPhysics
 from envs.tasks import TASKS
 
 HORIZON, LANES, STEPS = 3, 4, 8

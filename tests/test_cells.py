@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from policy_fixtures import small_config
 
-from cmrl_jax.cells import CELL, COLUMNS, FIGURES, RENAMED, SETTINGS, UNNAMED, CellTable
-from cmrl_jax.config import ConfigError
-from cmrl_jax.options import EvalOptions
-from cmrl_jax.settings import settings
+from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.evaluation.cells import CELL, COLUMNS, FIGURES, RENAMED, SETTINGS, UNNAMED, CellTable
+from cmrl_jax.evaluation.options import EvalOptions
+from cmrl_jax.evaluation.settings import settings
 
 OPTIONS = EvalOptions(horizon=200, physics="native")
 

@@ -22,10 +22,10 @@ from checkpoint_fixtures import (
     unlist,
 )
 
-from cmrl_jax import checkpoint
-from cmrl_jax.config import Config, ConfigError
-from cmrl_jax.config_io import to_dict
-from cmrl_jax.normalizers import init_obs_stats, init_return_stats
+from cmrl_jax.config.files import to_dict
+from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.nn.normalizers import init_obs_stats, init_return_stats
+from cmrl_jax.storage import checkpoint
 
 
 def test_everything_comes_back_bit_for_bit(tmp_path, monkeypatch):

@@ -24,8 +24,8 @@ from checkpoint_fixtures import (
     unlist,
 )
 
-from cmrl_jax import checkpoint, manifest
-from cmrl_jax.config import Config, ConfigError
+from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.storage import checkpoint, manifest
 
 
 def flip_a_bit(path, byte):

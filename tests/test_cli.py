@@ -11,10 +11,9 @@ from types import SimpleNamespace
 
 import pytest
 
-import cmrl_jax
-from cmrl_jax import run_dir
-from cmrl_jax.cli import main
-from cmrl_jax.config_io import load_config, to_yaml
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.storage import run_dir
 
 ROOT = Path(__file__).parent.parent
 
@@ -27,7 +26,7 @@ def here(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def calls(here, monkeypatch):
+def calls(here, replace_module):
     """Puts recorders in place of the programs; returns the list of (program, keywords)."""
     made = []
 
@@ -35,12 +34,11 @@ def calls(here, monkeypatch):
         return lambda *args, **kwargs: made.append((name, args, kwargs)) or 0
 
     for module, function in (
-        ("trainer", "train"),
-        ("bench", "main"),
+        ("training.trainer", "train"),
+        ("bench.main", "main"),
     ):
-        fake = SimpleNamespace(**{function: recorder(module)})
-        monkeypatch.setitem(sys.modules, f"cmrl_jax.{module}", fake)
-        monkeypatch.setattr(cmrl_jax, module, fake, raising=False)
+        fake = SimpleNamespace(**{function: recorder(module.rpartition(".")[2])})
+        replace_module(f"cmrl_jax.{module}", fake)
     return made
 
 
@@ -173,11 +171,11 @@ def test_mistake_is_one_cause_and_one_cure(refused, here, words, cause, cure):
     assert not list(here.iterdir())  # nothing was begun
 
 
-def test_other_exceptions_keep_their_traceback(calls, monkeypatch):
+def test_other_exceptions_keep_their_traceback(calls, replace_module):
     def broken(**kwargs):
         raise ValueError("a bug of ours")
 
-    monkeypatch.setattr(cmrl_jax, "trainer", SimpleNamespace(train=broken), raising=False)
+    replace_module("cmrl_jax.training.trainer", SimpleNamespace(train=broken))
     with pytest.raises(ValueError, match="a bug of ours"):
         main(["--config", "ml4.yaml"])
 
@@ -187,7 +185,7 @@ def test_other_exceptions_keep_their_traceback(calls, monkeypatch):
 
 def test_bench_hands_over_its_flags(calls):
     assert main(["bench", "--rows", "mjx,learner", "--json", "b.json"]) == 0
-    assert calls == [("bench", (), {"json_path": Path("b.json"), "rows": ("mjx", "learner")})]
+    assert calls == [("main", (), {"json_path": Path("b.json"), "rows": ("mjx", "learner")})]
 
 
 # train.py and set-up ----------------------------------------------------------------------------
@@ -197,7 +195,7 @@ def test_help_and_mistakes_import_neither_jax_nor_mujoco():
     """What makes `--help` answer in under a second."""
     script = """
 import sys
-from cmrl_jax.cli import main
+from cmrl_jax.cli.main import main
 for command in ([], ["eval"], ["sweep"], ["finetune"], ["bench"], ["render"], ["goals"]):
     try:
         main([*command, "--help"])
@@ -250,7 +248,7 @@ def test_train_py_without_a_package(monkeypatch, capsys, name):
     def missing():
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
-    monkeypatch.setitem(sys.modules, "cmrl_jax.cli", SimpleNamespace(main=missing))
+    monkeypatch.setitem(sys.modules, "cmrl_jax.cli.main", SimpleNamespace(main=missing))
     assert entry().start() == 2
     error, fix = capsys.readouterr().err.splitlines()
     assert error == "error: the package 'nosuchpackage' is not installed for this Python"
@@ -262,7 +260,7 @@ def test_train_py_keeps_the_traceback_of_our_own_bugs(monkeypatch, name):
     def broken():
         raise ModuleNotFoundError("a bug of ours", name=name)
 
-    monkeypatch.setitem(sys.modules, "cmrl_jax.cli", SimpleNamespace(main=broken))
+    monkeypatch.setitem(sys.modules, "cmrl_jax.cli.main", SimpleNamespace(main=broken))
     with pytest.raises(ModuleNotFoundError):
         entry().start()
 

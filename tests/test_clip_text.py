@@ -14,12 +14,12 @@ import pytest
 from flax.serialization import msgpack_serialize
 from safetensors.numpy import save_file
 
-from cmrl_jax import clip_tokenizer, clip_weights
-from cmrl_jax.cli import main
-from cmrl_jax.clip_text import Architecture
-from cmrl_jax.config import ConfigError
-from cmrl_jax.encoders import embed, find_encoder
-from cmrl_jax.goals import load_goals, read_table
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.text import clip_tokenizer, clip_weights
+from cmrl_jax.text.clip_text import Architecture
+from cmrl_jax.text.encoders import embed, find_encoder
+from cmrl_jax.text.goals import load_goals, read_table
 
 ROOT = Path(__file__).parent.parent
 SMALL = ("gelu", "legacy-eos")
@@ -241,7 +241,7 @@ def test_truncated_msgpack(tmp_path):
 def run_alone(words: list[str], **env: str) -> subprocess.CompletedProcess:
     """The command line in a process of its own; prints the modules of interest that it loaded."""
     code = (
-        "import sys; from cmrl_jax.cli import main; code = main(sys.argv[1:]);"
+        "import sys; from cmrl_jax.cli.main import main; code = main(sys.argv[1:]);"
         "print(sorted({'torch', 'transformers', 'mujoco'} & set(sys.modules))); sys.exit(code)"
     )
     command = [sys.executable, "-c", code, *words]

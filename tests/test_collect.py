@@ -5,8 +5,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from cmrl_jax.collect import make_noise_scale
-from cmrl_jax.config import Config
+from cmrl_jax.algorithms.cmrl.collect import make_noise_scale
+from cmrl_jax.config.schema import Config
 
 
 def config_of(lanes):

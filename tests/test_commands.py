@@ -10,8 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from cmrl_jax import commands, run_dir
+from cmrl_jax import commands
 from cmrl_jax.commands import command
+from cmrl_jax.storage import run_dir
 
 ROOT = Path(__file__).parent.parent
 NAMES = ["my run/a b", "it's", "$HOME", "a;b", "plain/run-1"]
@@ -41,7 +42,7 @@ def test_a_shell_reads_back_what_was_meant(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_commands_to_go_on_with_a_run_are_quoted(name):
-    from cmrl_jax.trainer import _Run
+    from cmrl_jax.training.trainer import _Run
 
     error = run_dir.cannot_write(Path(name), OSError(errno.ENOSPC, "No space left on device"))
     stopped = _Run.resume_command(SimpleNamespace(run_dir=Path(name)))  # pyright: ignore

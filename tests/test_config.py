@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cmrl_jax.config import Config, ConfigError, lane_groups, leaves
-from cmrl_jax.config_io import (
+from cmrl_jax.config.files import (
     FREE_ON_RESUME,
     changed_fields,
     check_resumable,
@@ -20,6 +19,7 @@ from cmrl_jax.config_io import (
     to_dict,
     to_yaml,
 )
+from cmrl_jax.config.schema import Config, ConfigError, lane_groups, leaves
 
 CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.yaml"))
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from env_fixtures import GOALS
 
-from envs.contact import (
+from envs.parity.reference import ReferenceEnv
+from envs.physics.mjx.contact import (
     base_handle_contacts,
     finger_capsule_contacts,
     mix,
@@ -16,9 +17,15 @@ from envs.contact import (
     sphere_box_contacts,
     stem_box,
 )
-from envs.geometry import Material, load_gripper, load_shapes
-from envs.model import FIXTURE_BODY, LEFT_FINGER, RIGHT_FINGER, SLIDE, load_fixture, load_scene
-from envs.reference import ReferenceEnv
+from envs.physics.mjx.geometry import Material, load_gripper, load_shapes
+from envs.physics.model import (
+    FIXTURE_BODY,
+    LEFT_FINGER,
+    RIGHT_FINGER,
+    SLIDE,
+    load_fixture,
+    load_scene,
+)
 from envs.tasks import SPECS, TASKS
 
 SCENE = {spec.name: spec.scene for spec in SPECS}

@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax.config import Config, EncoderConfig
-from cmrl_jax.context import (
+from cmrl_jax.config.schema import Config, EncoderConfig
+from cmrl_jax.nn.context import (
     context_mask,
     init_belief,
     make_context_inference,
     prior,
     reset_belief,
 )
-from cmrl_jax.networks import make_networks
+from cmrl_jax.nn.networks import make_networks
 
 TASKS, CONTEXT, OBS, ACT, GOAL, LATENT = 2, 6, 3, 2, 5, 4
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
-from cmrl_jax.diagnostics import CONTEXT_SIZES, make_diagnose
-from cmrl_jax.replay import sample_transitions
+from cmrl_jax.algorithms.cmrl.diagnostics import CONTEXT_SIZES, make_diagnose
+from cmrl_jax.algorithms.common.replay import sample_transitions
 
 KEY = jax.random.key(7)
 

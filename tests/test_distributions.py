@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax.distributions import (
+from cmrl_jax.nn.distributions import (
     Gaussian,
     kl_to_standard_normal,
     natural_sums,

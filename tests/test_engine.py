@@ -26,7 +26,12 @@ def python(*words, **environment):
 @pytest.mark.parametrize("gl", MISSING)
 @pytest.mark.parametrize(
     "module",
-    ["envs.model", "envs.reference", "cmrl_jax.normalizers", "cmrl_jax.evaluate_metaworld"],
+    [
+        "envs.physics.model",
+        "envs.parity.reference",
+        "cmrl_jax.nn.normalizers",
+        "cmrl_jax.evaluation.metaworld",
+    ],
 )
 def test_a_gl_library_that_is_missing_stops_no_import(gl, module):
     """Whichever comes first of MuJoCo, metaworld and mjx. Children see the value."""
@@ -42,7 +47,7 @@ def test_goal_sets_are_drawn_without_gl(tmp_path):
 
 def test_a_missing_library_leaves_no_trace_and_is_named_where_something_is_drawn():
     code = (
-        "import os; from envs.engine import mujoco; from envs.render import Renderer\n"
+        "import os; from envs.engine import mujoco; from envs.render.frames import Renderer\n"
         "assert 'PYOPENGL_PLATFORM' not in os.environ\n"
         "model = mujoco.MjModel.from_xml_string('<mujoco/>')\n"
         "try: Renderer(model, 8, 8)\n"
@@ -69,7 +74,8 @@ def test_a_library_that_is_there_draws_as_ever(gl):
 def test_a_display_that_does_not_open_is_passed_over(gl):
     """For the library that draws there; a context alone is made on such a display, too."""
     code = (
-        "import os; from envs.render import choose_gl; choose_gl(); print(os.environ['MUJOCO_GL'])"
+        "import os; from envs.render.frames import choose_gl; choose_gl(); "
+        "print(os.environ['MUJOCO_GL'])"
     )
     chosen = python("-c", code, MUJOCO_GL="", DISPLAY=":4242", WAYLAND_DISPLAY="")
     assert chosen in ("egl", "osmesa")

@@ -8,8 +8,8 @@ from env_fixtures import GOALS, GOALS_A_TASK, LANE_GOALS, LANE_TASKS, LANES
 
 import envs
 from envs.goal_sets import RESET_BOX, load_goal_set
-from envs.parity_parts import draw_noise, port_episodes, reference_episodes
-from envs.reference import ReferenceEnv
+from envs.parity.parts import draw_noise, port_episodes, reference_episodes
+from envs.parity.reference import ReferenceEnv
 from envs.sawyer import OBJECT, Ml4Env
 from envs.tasks import TASKS
 

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import model as env_model
-from envs.model import FIXTURE_BODY, FIXTURE_ROOT, ROBOT_JOINTS, SCENES, SLIDE
+from envs.physics import model as env_model
+from envs.physics.model import FIXTURE_BODY, FIXTURE_ROOT, ROBOT_JOINTS, SCENES, SLIDE
 
 
 @pytest.fixture(scope="module", params=SCENES)

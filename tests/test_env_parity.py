@@ -1,4 +1,4 @@
-"""`python -m envs.parity`: what it writes, what it refuses."""
+"""`python -m envs.parity.__main__`: what it writes, what it refuses."""
 
 import json
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from env_fixtures import GOALS_A_TASK, LANES
 
-from envs import parity, parity_parts
-from envs.parity_report import finite, table
+from envs.parity import __main__ as parity
+from envs.parity import parts as parity_parts
+from envs.parity.report import finite, table
 from envs.tasks import TASKS
 
 RUN = ("--goals", str(GOALS_A_TASK), "--horizon", "12")

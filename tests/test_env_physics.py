@@ -3,8 +3,8 @@
 import numpy as np
 from env_fixtures import GOALS, LANE_GOALS, LANE_TASKS, LANES
 
-from envs import parity_parts
-from envs.reference import ReferenceEnv
+from envs.parity import parts as parity_parts
+from envs.parity.reference import ReferenceEnv
 from envs.tasks import HAND_HIGH, HAND_LOW, TASKS
 
 # Hand targets (m; x, y, z from the fixture unless the third row says table) and finger effort, by

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from policy_fixtures import HORIZON, MovingEnv, random_policy, small_config
 
-from cmrl_jax.controls import donors
-from cmrl_jax.evaluate import Evaluator, Trial, lane_names
-from cmrl_jax.options import MOST_DRAWS
-from cmrl_jax.replay import Transition
-from cmrl_jax.session import Session
+from cmrl_jax.algorithms.common.replay import Transition
+from cmrl_jax.evaluation.controls import donors
+from cmrl_jax.evaluation.evaluator import Evaluator, Trial, lane_names
+from cmrl_jax.evaluation.options import MOST_DRAWS
+from cmrl_jax.evaluation.session import Session
 from envs.goal_names import GOALS
 from envs.tasks import TASKS, task_id
 

@@ -1,15 +1,13 @@
 """Flags of `eval` and `sweep`: what they hand on, and their mistakes."""
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-import cmrl_jax
-from cmrl_jax.cli import main
-from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.options import EvalOptions
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.evaluation.options import EvalOptions
 from envs.outputs import write_json
 
 
@@ -21,14 +19,12 @@ def here(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def calls(here, monkeypatch):
+def calls(here, replace_module):
     """Puts recorders in place of the two programs; returns the list of their keywords."""
     made = []
     record = lambda **kwargs: made.append(kwargs) or 0
-    for module, function in (("evaluate_cli", "evaluate_run"), ("sweep", "sweep")):
-        fake = SimpleNamespace(**{function: record})
-        monkeypatch.setitem(sys.modules, f"cmrl_jax.{module}", fake)
-        monkeypatch.setattr(cmrl_jax, module, fake, raising=False)
+    for module, function in (("cli.evaluate", "evaluate_run"), ("evaluation.sweep", "sweep")):
+        replace_module(f"cmrl_jax.{module}", SimpleNamespace(**{function: record}))
     return made
 
 
@@ -112,7 +108,7 @@ def test_eval_hands_over_its_flags(calls, here):
     assert not (here / "out").exists()  # tried, and left to the command to make
 
 
-def test_sweep_hands_over_its_flags(calls, refused, here):
+def test_sweep_hands_over_its_flags(calls, refused, here, replace_module):
     for name in ("a-2", "a-1", "b"):
         make_run(here / "runs" / name)
     (here / "runs" / "a-3").mkdir()  # holds no run
@@ -122,12 +118,16 @@ def test_sweep_hands_over_its_flags(calls, refused, here):
     assert main(["sweep", "--runs", "runs/b", "--compare", "8"]) == 0
     assert calls[0] == {
         "runs": [Path("runs/b"), Path("runs/a-1"), Path("runs/a-2")], "checkpoints": (20, 40),
-        "options": OPTIONS, "json_path": Path("f.json"), "csv_path": Path("f.csv"), "compare": 0,
-        "force": False,
+        "options": OPTIONS, "json_path": Path("f.json"), "csv_path": Path("f.csv"),
+        "compare": None, "force": False,
     }  # fmt: skip
+    replace_module("cmrl_jax.bench.sweep", SimpleNamespace(compared=lambda *args: args))
+    members, table, progress = (object() for _ in range(3))
+    compared = calls[1].pop("compare")(members, table, progress)
+    assert compared == (members, EvalOptions(), table, 8, progress)
     assert calls[1] == {
         "runs": [Path("runs/b")], "checkpoints": "last", "options": EvalOptions(),
-        "json_path": None, "csv_path": None, "compare": 8, "force": False,
+        "json_path": None, "csv_path": None, "force": False,
     }  # fmt: skip
     make_run(here / "runs" / "m", "mtsac.yaml")
     assert "(runs/m)" in refused("sweep", "--runs", "runs/*", "--k", "0,1")[0]

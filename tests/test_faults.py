@@ -30,9 +30,9 @@ from run_helpers import (
     steps,
 )
 
-from cmrl_jax.checkpoint import full_store, policy_store
-from cmrl_jax.run_dir import LOCK, writing_to
-from envs.native import NativePhysics
+from cmrl_jax.storage.checkpoint import full_store, policy_store
+from cmrl_jax.storage.run_dir import LOCK, writing_to
+from envs.physics.native import NativePhysics
 
 
 @pytest.fixture

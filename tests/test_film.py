@@ -14,15 +14,15 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 from policy_fixtures import save_run
 
-from cmrl_jax.checkpoint import policy_store
-from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.film import HEIGHT, STRIP, WIDTH, Episode
-from cmrl_jax.render import FilmedEnv, film_run
-from cmrl_jax.session import Policy, Session, policy_params
-from cmrl_jax.versions import package_versions
+from cmrl_jax.analysis.film import HEIGHT, STRIP, WIDTH, Episode
+from cmrl_jax.analysis.render import FilmedEnv, film_run
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.evaluation.session import Policy, Session, policy_params
+from cmrl_jax.storage.checkpoint import policy_store
+from cmrl_jax.storage.versions import package_versions
 from envs.goal_sets import load_goal_set
-from envs.reference import record_rollout
+from envs.parity.reference import record_rollout
 from envs.tasks import TASKS
 
 ROOT = Path(__file__).parent.parent
@@ -132,7 +132,7 @@ def test_a_policy_without_latent_explores_nothing(tmp_path, refused):
 FILM = """
 import sys
 import numpy as np
-from cmrl_jax.evaluate import Evaluator
+from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.film import Camera, Episode, Film, write_sheet, write_video
 from envs.goal_sets import load_goal_set
 from envs.reference import record_rollout

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
-from cmrl_jax import finetune, finetune_cli
-from cmrl_jax.cli import main
-from cmrl_jax.config import Config, ConfigError
-from cmrl_jax.config_io import load_config
-from cmrl_jax.context import init_belief
-from cmrl_jax.finetune import (
+from cmrl_jax.algorithms.cmrl.learner import make_learner
+from cmrl_jax.algorithms.common.replay import ContextBatch
+from cmrl_jax.cli import finetune as finetune_cli
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config
+from cmrl_jax.config.rules import validate
+from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.evaluation import finetune
+from cmrl_jax.evaluation.finetune import (
     FineTuning,
     adaptation_curve,
     finetune_config,
@@ -24,13 +27,11 @@ from cmrl_jax.finetune import (
     restrict,
     start_state,
 )
-from cmrl_jax.finetune_options import ADAPT, FinetuneOptions, check_run
-from cmrl_jax.goals import load_goals
-from cmrl_jax.learner import make_learner
-from cmrl_jax.replay import ContextBatch
-from cmrl_jax.session import Session
-from cmrl_jax.validate import validate
-from envs.native import NativePhysics
+from cmrl_jax.evaluation.finetune_options import ADAPT, FinetuneOptions, check_run
+from cmrl_jax.evaluation.session import Session
+from cmrl_jax.nn.context import init_belief
+from cmrl_jax.text.goals import load_goals
+from envs.physics.native import NativePhysics
 
 NETWORKS = ("actor_params", "critic_params", "target_critic_params", "encoder_params")
 

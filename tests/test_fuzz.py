@@ -10,7 +10,6 @@ import io
 import os
 import re
 import shutil
-import sys
 from collections import Counter
 from pathlib import Path
 from types import ModuleType
@@ -23,10 +22,9 @@ from hypothesis.internal.conjecture import providers
 from hypothesis.internal.constants_ast import Constants
 from test_structure import LIGHT, LIGHT_OF_ENVS, MODULES
 
-import cmrl_jax
-from cmrl_jax import cli
-from cmrl_jax.config import ConfigError
-from cmrl_jax.config_io import read_yaml, resolve, to_yaml
+from cmrl_jax.cli import main as cli
+from cmrl_jax.config.files import read_yaml, resolve, to_yaml
+from cmrl_jax.config.schema import ConfigError
 
 TIMES = int(os.environ.get("FUZZ", "1"))
 
@@ -149,14 +147,11 @@ class Sandbox:
 
 
 @pytest.fixture
-def sandbox(tmp_path, monkeypatch):
-    for name in MODULES:
-        package, _, module = name.rpartition(".")
-        light = {"cmrl_jax": LIGHT, "envs": LIGHT_OF_ENVS}.get(package)
-        if light is not None and module not in light:
-            monkeypatch.setitem(sys.modules, name, Stub(name))
-            if package == "cmrl_jax":
-                monkeypatch.setattr(cmrl_jax, module, Stub(name), raising=False)
+def sandbox(tmp_path, monkeypatch, replace_module):
+    light = {f"cmrl_jax.{name}" for name in LIGHT} | {f"envs.{name}" for name in LIGHT_OF_ENVS}
+    for name, path in MODULES.items():
+        if path.stem != "__init__" and name not in light:
+            replace_module(name, Stub(name))
     monkeypatch.chdir(tmp_path)  # and back at the end
     return Sandbox(tmp_path / "top")
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from cmrl_jax import goal_builder, minilm
-from cmrl_jax.cli import main
-from cmrl_jax.config import TASKS, ConfigError
-from cmrl_jax.encoders import embed, file_sha256
-from cmrl_jax.goal_files import table_path
-from cmrl_jax.goals import load_goals, read_table
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.schema import TASKS, ConfigError
+from cmrl_jax.text import goal_builder, minilm
+from cmrl_jax.text.encoders import embed, file_sha256
+from cmrl_jax.text.goal_files import table_path
+from cmrl_jax.text.goals import load_goals, read_table
 
 GOLDEN = Path(__file__).parent / "golden" / "tiny_bert.npz"
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cmrl_jax import goal_files
-from cmrl_jax.config import GOAL_ABLATIONS, TASKS, ConfigError
-from cmrl_jax.goal_builder import all_vectors, read_prompts, task_cosines
-from cmrl_jax.goal_files import PROMPTS_FILE, table_path
-from cmrl_jax.goals import check_same_table, load_goals, read_table
+from cmrl_jax.config.schema import GOAL_ABLATIONS, TASKS, ConfigError
+from cmrl_jax.text import goal_files
+from cmrl_jax.text.goal_builder import all_vectors, read_prompts, task_cosines
+from cmrl_jax.text.goal_files import PROMPTS_FILE, table_path
+from cmrl_jax.text.goals import check_same_table, load_goals, read_table
 
 MINILM = table_path("minilm-l6-v2")
 
@@ -88,7 +88,7 @@ def test_tasks_are_picked_by_name():
 
 def test_run_time_needs_no_encoder():
     code = (
-        "import sys; from cmrl_jax.goals import load_goals;"
+        "import sys; from cmrl_jax.text.goals import load_goals;"
         "load_goals('minilm-l6-v2', ('drawer-open',));"
         "sys.exit(', '.join({'torch', 'transformers', 'jax', 'yaml'} & set(sys.modules)) or 0)"
     )

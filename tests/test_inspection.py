@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from policy_fixtures import HORIZON, MovingEnv, random_policy, save_run, small_config
 
-from cmrl_jax.cli import main
-from cmrl_jax.config_io import to_yaml
-from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.inspection import DRAWS, GOALS, inspect_policy
-from cmrl_jax.inspection_file import read_inspection
-from cmrl_jax.session import Policy, Session
+from cmrl_jax.analysis.inspection import DRAWS, GOALS, inspect_policy
+from cmrl_jax.analysis.inspection_file import read_inspection
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import to_yaml
+from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.evaluation.session import Policy, Session
 from envs.tasks import task_id
 
 RUNS = 4  # of a task: 2 goals, 2 draws each

@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cmrl_jax import inspection_figures
-from cmrl_jax.cli import main
-from cmrl_jax.config import ConfigError
-from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.inspection_figures import between_tasks, plot_latents, plot_routing, verdict
-from cmrl_jax.inspection_file import (
+from cmrl_jax.analysis import inspection_figures
+from cmrl_jax.analysis.inspection_figures import between_tasks, plot_latents, plot_routing, verdict
+from cmrl_jax.analysis.inspection_file import (
     Inspection,
     Latents,
     Usage,
     read_inspection,
     write_inspection,
 )
-from cmrl_jax.pca import principal_axes
-from cmrl_jax.plots import _pyplot
+from cmrl_jax.analysis.pca import principal_axes
+from cmrl_jax.analysis.plots import _pyplot
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.config.schema import ConfigError
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 FACTS = {"k": 2, "goals": 5, "draws": 2, "goal_set": "heldout", "env_steps": 1200000}

@@ -9,11 +9,11 @@ import jax
 import pytest
 from run_helpers import assert_same_result, native, run_in_shell, smoke, smoke_words
 
-from cmrl_jax.config import ConfigError
-from cmrl_jax.config_io import load_config
+from cmrl_jax.config.files import load_config
+from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.jax_runtime import cache_directory, check_switches
-from cmrl_jax.run_dir import holds_run
-from cmrl_jax.trainer import Schedule, _Run
+from cmrl_jax.storage.run_dir import holds_run
+from cmrl_jax.training.trainer import Schedule, _Run
 from envs import goal_sets
 
 

@@ -10,13 +10,13 @@ import numpy as np
 import optax
 import pytest
 
-from cmrl_jax import replay
-from cmrl_jax.config import Config
-from cmrl_jax.distributions import sample_tanh_gaussian
-from cmrl_jax.learner import make_learner, per_task
-from cmrl_jax.networks import Routing
-from cmrl_jax.objectives import ActorSide, CriticSide, Minibatch, routing_health
-from cmrl_jax.optimizers import adam_step, clip_by_norm, init_adam, ravel, unravel
+from cmrl_jax.algorithms.cmrl.learner import make_learner, per_task
+from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch, routing_health
+from cmrl_jax.algorithms.common import replay
+from cmrl_jax.config.schema import Config
+from cmrl_jax.nn.distributions import sample_tanh_gaussian
+from cmrl_jax.nn.networks import Routing
+from cmrl_jax.nn.optimizers import adam_step, clip_by_norm, init_adam, ravel, unravel
 
 TASKS, BATCH, CONTEXT, OBS, ACT, GOAL, LATENT = 3, 4, 5, 3, 2, 6, 2
 LANES, CAPACITY = 2, 24

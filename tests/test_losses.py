@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax import losses
+from cmrl_jax.algorithms.cmrl import losses
 
 TASKS, BATCH, BINS = 3, 4, 7
 RNG = np.random.default_rng(0)

@@ -13,10 +13,11 @@ from metaworld.evaluation import metalearning_evaluation
 from metaworld_fixtures import Recorder
 from policy_fixtures import HORIZON, random_policy, save_run, small_config
 
-from cmrl_jax import evaluate_metaworld
-from cmrl_jax.cli import main
-from cmrl_jax.evaluate import Evaluator, lane_names
-from cmrl_jax.evaluate_metaworld import (
+from cmrl_jax.algorithms.common.replay import Transition
+from cmrl_jax.cli.main import main
+from cmrl_jax.evaluation import metaworld as evaluate_metaworld
+from cmrl_jax.evaluation.evaluator import Evaluator, lane_names
+from cmrl_jax.evaluation.metaworld import (
     adaptation_run,
     agent_of,
     format_own,
@@ -24,12 +25,11 @@ from cmrl_jax.evaluate_metaworld import (
     metaworlds_own,
     of_task,
 )
-from cmrl_jax.metaworld_agent import MetaWorldAgent
-from cmrl_jax.options import EvalOptions
-from cmrl_jax.replay import Transition
-from cmrl_jax.session import Policy, Session
-from envs.metaworld_envs import make_vector_env, set_goals
-from envs.reference import record_rollout
+from cmrl_jax.evaluation.metaworld_agent import MetaWorldAgent
+from cmrl_jax.evaluation.options import EvalOptions
+from cmrl_jax.evaluation.session import Policy, Session
+from envs.adapters.metaworld_envs import make_vector_env, set_goals
+from envs.parity.reference import record_rollout
 from envs.sawyer import OBS_SIZE
 from envs.tasks import TASKS
 

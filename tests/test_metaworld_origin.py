@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from policy_fixtures import HORIZON, random_policy, small_config
 
-from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_metaworld import agent_of, k_shot, of_task
-from cmrl_jax.session import Policy, Session
-from envs.metaworld_envs import make_vector_env, set_goals
+from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.evaluation.metaworld import agent_of, k_shot, of_task
+from cmrl_jax.evaluation.session import Policy, Session
+from envs.adapters.metaworld_envs import make_vector_env, set_goals
 from envs.sawyer import OBJECT
 from envs.tasks import TASKS, task_id
 

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from run_helpers import csv_points, tensorboard_points
 
-from cmrl_jax import formats, metrics, versions
-from cmrl_jax.config import ConfigError
+from cmrl_jax import formats
+from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.storage import versions
+from cmrl_jax.training import metrics
 
 COLUMNS = (*metrics.LEADING_COLUMNS, "train/critic_loss", "eval/drawer-open/k0/success_any")
 
@@ -132,7 +134,8 @@ def test_tensorboard_events_hold_the_figures(tmp_path):
 
 def test_a_killed_process_leaves_every_row_in_tensorboard(tmp_path):
     pytest.importorskip("tensorboardX")
-    script = "import os, sys; from pathlib import Path; from cmrl_jax.metrics import TensorBoard\n"
+    script = "import os, sys; from pathlib import Path\n"
+    script += "from cmrl_jax.training.metrics import TensorBoard\n"
     script += "sink = TensorBoard(Path(sys.argv[1]))\n"
     script += "row = {'env_steps': 10, 'wall_s': 0.5} | {f'train/{i}': i for i in range(40)}\n"
     script += "sink.write(row); os._exit(0)"
@@ -244,13 +247,13 @@ def test_versions_name_everything_a_result_depends_on(tmp_path):
     assert found["jax"] == jax.__version__ and found["numpy"] == np.__version__
     assert found["python"] == sys.version.split()[0]
     assert found["mujoco"] == found["mujoco-mjx"]
-    assert None not in [found[p] for p in metrics.PACKAGES]
+    assert None not in [found[p] for p in versions.PACKAGES]
     assert found["device"].startswith("cpu") and found["cpu_count"] >= 1
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT[\d:]{8}\+00:00", found["date"])
 
 
 def test_a_missing_package_has_no_version(monkeypatch):
-    monkeypatch.setattr(metrics, "PACKAGES", ("jax", "no-such-package-here"))
+    monkeypatch.setattr(versions, "PACKAGES", ("jax", "no-such-package-here"))
     assert versions.package_versions()["no-such-package-here"] is None
 
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from env_fixtures import LANE_GOALS, LANE_TASKS, LANES
 
-from cmrl_jax.cli import main
-from cmrl_jax.collect import init_run, make_train_iteration
-from cmrl_jax.config_io import load_config
-from cmrl_jax.session import Session
-from envs.native import NativePhysics, unpack
-from envs.reference import ReferenceEnv, scripted_policy
+from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config
+from cmrl_jax.evaluation.session import Session
+from envs.parity.reference import ReferenceEnv, scripted_policy
+from envs.physics.native import NativePhysics, unpack
 from envs.sawyer import OBS_MODES, Ml4Env, State
 from envs.tasks import SCENE_ID, SPECS, TASKS
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax.config import Config, EncoderConfig, ModelConfig
-from cmrl_jax.layers import make_initialisers
-from cmrl_jax.networks import SoftModularNet, make_networks
+from cmrl_jax.config.schema import Config, EncoderConfig, ModelConfig
+from cmrl_jax.nn.layers import make_initialisers
+from cmrl_jax.nn.networks import SoftModularNet, make_networks
 
 TASKS, BATCH, FEATURES, LATENT = 2, 3, 5, 4
 TRUNK, GATING, WIDTH, OUT = 6, 5, 4, 2

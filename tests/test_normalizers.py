@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax import normalizers
-from cmrl_jax.config import SacConfig
-from cmrl_jax.moments import Count, Moments
+from cmrl_jax.config.schema import SacConfig
+from cmrl_jax.nn import normalizers
+from cmrl_jax.nn.moments import Count, Moments
 
 TASKS, LANES, GAMMA = 3, 4, 0.9
 

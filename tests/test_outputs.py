@@ -3,22 +3,22 @@
 import contextlib
 import json
 import os
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-import cmrl_jax
-from cmrl_jax import plot_flags, render_flags
-from cmrl_jax.cli import main
-from cmrl_jax.config import TASKS, ConfigError
-from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.flags import Parser, parse
-from envs import goal_sets, parity, picture
+from cmrl_jax.cli import plot_flags, render_flags
+from cmrl_jax.cli.flags import Parser, parse
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.config.schema import TASKS, ConfigError
+from envs import goal_sets
 from envs.command_line import brief
 from envs.outputs import check_output, replacing, save_figure, write_json, written_by
+from envs.parity import __main__ as parity
+from envs.render import picture
 
 MARK = written_by("eval")
 
@@ -198,12 +198,11 @@ def test_goal_sets_are_written_again(here):
     assert Path("F.npz").read_bytes() == goal_sets._PACKAGED.read_bytes()
 
 
-def test_force_is_handed_on(here, monkeypatch):
+def test_force_is_handed_on(here, replace_module):
     foreign("F", "D/window-open.mp4")
     made = []
     fake = SimpleNamespace(main=lambda **kwargs: made.append(kwargs) or 0)
-    monkeypatch.setitem(sys.modules, "cmrl_jax.bench", fake)
-    monkeypatch.setattr(cmrl_jax, "bench", fake, raising=False)
+    replace_module("cmrl_jax.bench.main", fake)
     assert main(["bench", "--json", "F", "--force"]) == 0 and made
     flags = render_flags.add_flags(Parser())
     words = ["--run", "run", "--out", "D"]
@@ -214,7 +213,9 @@ def test_force_is_handed_on(here, monkeypatch):
 
 def test_figures_of_goals_are_drawn_again_and_forced_without_a_table_made(here, monkeypatch):
     foreign("F.png")
-    monkeypatch.setattr("cmrl_jax.goal_builder.build", lambda *args: pytest.fail("a table is made"))
+    monkeypatch.setattr(
+        "cmrl_jax.text.goal_builder.build", lambda *args: pytest.fail("a table is made")
+    )
     assert main(["goals", "--figure", "F.png", "--force"]) == 0
     assert main(["goals", "--figure", "F.png"]) == 0
     assert Path("F.png").read_bytes().startswith(b"\x89PNG")
@@ -223,7 +224,7 @@ def test_figures_of_goals_are_drawn_again_and_forced_without_a_table_made(here, 
 def test_films_say_who_made_them(here):
     from PIL import Image
 
-    from cmrl_jax.film import Episode, Film, write_sheet, write_video
+    from cmrl_jax.analysis.film import Episode, Film, write_sheet, write_video
 
     blank = SimpleNamespace(take=lambda episode, step: np.zeros((352, 480, 3), np.uint8))
     episode = Episode("e", np.zeros((3, 10)), np.zeros(3, bool), 0.0)

@@ -18,9 +18,9 @@ import pytest
 from run_helpers import ITERATIONS, ROOT, checkpoint_leaves, native, rows_of, smoke, start
 
 from cmrl_jax import parallel
-from cmrl_jax.config import ConfigError
-from cmrl_jax.config_io import load_config
-from cmrl_jax.validate import check_devices
+from cmrl_jax.config.files import load_config
+from cmrl_jax.config.rules import check_devices
+from cmrl_jax.config.schema import ConfigError
 
 DEVICES = 4
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from run_file_helpers import CSV, evaluation, write_run
 
-from cmrl_jax import plots
-from cmrl_jax.cli import main
-from cmrl_jax.config import TASKS, ConfigError
-from cmrl_jax.plots import Runs, band, read_metrics, series
+from cmrl_jax.analysis import plots
+from cmrl_jax.analysis.plots import Runs, band, read_metrics, series
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.schema import TASKS, ConfigError
 
 ROOT = Path(__file__).parent.parent
 # One panel is drawn faster than four.

@@ -31,9 +31,9 @@ from run_helpers import (
     steps,
 )
 
-from cmrl_jax import cli
-from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.run_dir import LOCK, new_run, writing_to
+from cmrl_jax.cli import main as cli
+from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.storage.run_dir import LOCK, new_run, writing_to
 
 
 def run_unread(lines, *words):

@@ -6,9 +6,9 @@ import warnings
 import numpy as np
 import pytest
 
-from envs import reference
 from envs.goal_sets import load_goal_set
-from envs.reference import ReferenceEnv, record_rollout, scripted_policy
+from envs.parity import reference
+from envs.parity.reference import ReferenceEnv, record_rollout, scripted_policy
 
 TASKS = reference.TASKS
 GOALS = dict(zip(TASKS, load_goal_set("heldout", TASKS), strict=True))

@@ -13,13 +13,20 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from envs import port_scene
-from envs.contact import BASE_SLOTS, FINGER_SLOTS, find_contacts
-from envs.geometry import load_gripper, load_shapes
-from envs.model import ARM_JOINTS, LEFT_FINGER, RIGHT_FINGER, SLIDE, load_fixture, load_scene
-from envs.picture import half_way
-from envs.reference import ReferenceEnv
-from envs.render import camera_of, metaworld_scene
+from envs.parity.reference import ReferenceEnv
+from envs.physics.mjx.contact import BASE_SLOTS, FINGER_SLOTS, find_contacts
+from envs.physics.mjx.geometry import load_gripper, load_shapes
+from envs.physics.model import (
+    ARM_JOINTS,
+    LEFT_FINGER,
+    RIGHT_FINGER,
+    SLIDE,
+    load_fixture,
+    load_scene,
+)
+from envs.render import port_scene
+from envs.render.frames import camera_of, metaworld_scene
+from envs.render.picture import half_way
 from envs.tasks import SPECS, TASKS
 
 ROOT = Path(__file__).parent.parent
@@ -188,7 +195,7 @@ def python(code, **environment):
 
 @pytest.mark.parametrize("gl", ["off", "no-such-library"])
 def test_missing_gl_is_two_lines(gl, tmp_path):
-    done = python(["-m", "envs.picture", "--out", str(tmp_path / "new")], MUJOCO_GL=gl)
+    done = python(["-m", "envs.render.picture", "--out", str(tmp_path / "new")], MUJOCO_GL=gl)
     cause, cure = done.stderr.splitlines()
     assert (done.returncode, done.stdout) == (2, "") and not (tmp_path / "new").exists()
     assert cause.startswith("error: ") and f"MUJOCO_GL={gl} does not work" in cause
@@ -202,7 +209,7 @@ def pictures(gl, tmp_path_factory):
     done = python(
         [
             "-c",
-            "import sys, numpy as np; from envs.picture import draw_task\n"
+            "import sys, numpy as np; from envs.render.picture import draw_task\n"
             "tasks = 'drawer-open', 'window-open', 'window-close'\n"
             "np.savez(sys.argv[1], **{t: np.stack(draw_task(t)[1:3]) for t in tasks})",
             str(out),

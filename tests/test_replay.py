@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax import replay
+from cmrl_jax.algorithms.common import replay
 
 TASKS, LANES, STEPS, OBS, ACT = 2, 3, 8, 4, 2
 CAPACITY = LANES * STEPS

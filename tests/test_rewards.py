@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from env_fixtures import GOALS, LANE_GOALS, LANE_TASKS
 
-from envs import parity_parts
-from envs.parity_parts import SUCCESS_DISTANCE, THRESHOLD_BAND
-from envs.reference import ReferenceEnv
+from envs.parity import parts as parity_parts
+from envs.parity.parts import SUCCESS_DISTANCE, THRESHOLD_BAND
+from envs.parity.reference import ReferenceEnv
 from envs.rewards import gaussian, hamacher_product, long_tail
 from envs.sawyer import Ml4Env
 from envs.tasks import TASKS, task_id

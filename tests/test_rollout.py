@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from cmrl_jax.rollout import correlated_noise
+from cmrl_jax.algorithms.common.rollout import correlated_noise
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.9])

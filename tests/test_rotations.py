@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import rotations
+from envs.physics.mjx import rotations
 
 RANDOM = np.random.default_rng(0)
 

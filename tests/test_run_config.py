@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import yaml
 
-from cmrl_jax.config_io import (
+from cmrl_jax.config.files import (
     changed_fields,
     check_resumable,
     load_config,
@@ -15,7 +15,7 @@ from cmrl_jax.config_io import (
     to_dict,
     to_yaml,
 )
-from cmrl_jax.run_groups import group_runs, settings_of
+from cmrl_jax.storage.run_groups import group_runs, settings_of
 
 
 def make_old_run(run, obs_mode):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from run_file_helpers import CSV, evaluation, write_run
 
-from cmrl_jax.config import ConfigError
-from cmrl_jax.documents import read_json
-from cmrl_jax.run_files import (
+from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.storage.documents import read_json
+from cmrl_jax.storage.run_files import (
     find_evaluation,
     read_adaptation,
     read_evaluation,

@@ -4,14 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from cmrl_jax.config import Config, leaves
-from cmrl_jax.config_io import load_config
-from cmrl_jax.run_groups import (
-    FREE_AMONG_SEEDS,
-    group_runs,
-    settings_of,
-    shown_names,
-)
+from cmrl_jax.config.files import load_config
+from cmrl_jax.config.schema import Config, leaves
+from cmrl_jax.storage.run_groups import FREE_AMONG_SEEDS, group_runs, settings_of, shown_names
 
 
 def made_with(**of_run):

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from cmrl_jax.cells import COLUMNS, FIGURES, CellTable
-from cmrl_jax.episode import Episode
-from cmrl_jax.scores import (
+from cmrl_jax.evaluation.cells import COLUMNS, FIGURES, CellTable
+from cmrl_jax.evaluation.episode import Episode
+from cmrl_jax.evaluation.scores import (
     bootstrap_interval,
     cell_rows,
     format_scores,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from envs.mjx_physics import LINE_SEARCH_ITERATIONS, SOLVER_ITERATIONS
-from envs.solver import Cones, Rows, make_cones, make_rows, solve
+from envs.physics.mjx.backend import LINE_SEARCH_ITERATIONS, SOLVER_ITERATIONS
+from envs.physics.mjx.solver import Cones, Rows, make_cones, make_rows, solve
 
 BALL = """
 <mujoco><option timestep="0.0025" cone="elliptic"/>

@@ -9,18 +9,18 @@ import jax
 import pytest
 from policy_fixtures import save_run, small_config
 
-from cmrl_jax import bench_sweep
-from cmrl_jax import sweep as sweep_module
-from cmrl_jax.bench_sweep import command_words
-from cmrl_jax.cells import CellTable
-from cmrl_jax.cli import main
-from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.evaluate_flags import eval_parser, options_of, sweep_parser
-from cmrl_jax.flags import parse
-from cmrl_jax.session import Session
-from cmrl_jax.sweep import INTERRUPTED
-from cmrl_jax.targets import targets_of
-from envs.native import NativePhysics
+from cmrl_jax.bench import sweep as bench_sweep
+from cmrl_jax.bench.sweep import command_words
+from cmrl_jax.cli.evaluate_flags import eval_parser, options_of, sweep_parser
+from cmrl_jax.cli.flags import parse
+from cmrl_jax.cli.main import main
+from cmrl_jax.evaluation import sweep as sweep_module
+from cmrl_jax.evaluation.cells import CellTable
+from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.evaluation.session import Session
+from cmrl_jax.evaluation.sweep import INTERRUPTED
+from cmrl_jax.evaluation.targets import targets_of
+from envs.physics.native import NativePhysics
 
 GOALS, KS, TASKS = 3, ("0", "2"), 4
 PROTOCOL = ["--goals", str(GOALS), "--k", ",".join(KS)]

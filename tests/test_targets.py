@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from policy_fixtures import random_policy, save_run, small_config
 
-from cmrl_jax.config import Config, leaves
-from cmrl_jax.evaluate import Evaluator
-from cmrl_jax.goal_files import table_path
-from cmrl_jax.options import EvalOptions
-from cmrl_jax.session import Session
-from cmrl_jax.targets import IDLE, Target, columns_of, program_key, targets_of
-from cmrl_jax.trials import Plan, fitted, plan_batches
+from cmrl_jax.config.schema import Config, leaves
+from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.evaluation.options import EvalOptions
+from cmrl_jax.evaluation.session import Session
+from cmrl_jax.evaluation.targets import IDLE, Target, columns_of, program_key, targets_of
+from cmrl_jax.evaluation.trials import Plan, fitted, plan_batches
+from cmrl_jax.text.goal_files import table_path
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax import learner as learner_module
-from cmrl_jax import losses, replay
-from cmrl_jax.config import Config
-from cmrl_jax.learner import make_learner
+from cmrl_jax.algorithms.cmrl import learner as learner_module
+from cmrl_jax.algorithms.cmrl import losses
+from cmrl_jax.algorithms.cmrl.learner import make_learner
+from cmrl_jax.algorithms.common import replay
+from cmrl_jax.config.schema import Config
 
 TASKS, LANES, HORIZON, CONTEXT, ITERATIONS, UPDATES = 2, 8, 10, 16, 60, 16
 SIGN = jnp.array([1.0, -1.0])

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from run_helpers import ROOT, assert_same_result, rows_of, run_and_signal, smoke
 
-from cmrl_jax import goal_files
-from cmrl_jax.checkpoint import full_store
-from cmrl_jax.cli import main
-from cmrl_jax.collect import init_run, make_train_iteration
-from cmrl_jax.config import lane_groups
-from cmrl_jax.config_io import load_config
-from cmrl_jax.session import Session, load_policy
+from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config
+from cmrl_jax.config.schema import lane_groups
+from cmrl_jax.evaluation.session import Session, load_policy
+from cmrl_jax.storage.checkpoint import full_store
+from cmrl_jax.text import goal_files
 
 
 @pytest.fixture(scope="module")

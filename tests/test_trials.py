@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from policy_fixtures import random_policy, small_config
 
-import cmrl_jax
-from cmrl_jax.config import ConfigError
-from cmrl_jax.config_io import load_config, to_yaml
-from cmrl_jax.options import EvalOptions, check_run
-from cmrl_jax.session import Policy, Session
-from cmrl_jax.trials import batch_lanes, evaluation_config, trial_of
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.evaluation.options import EvalOptions, check_run
+from cmrl_jax.evaluation.session import Policy, Session
+from cmrl_jax.evaluation.trials import batch_lanes, evaluation_config, trial_of
 
 CASES = ("drawer-open", "drawer-close", "window-open", "window-close")
 
@@ -84,7 +83,7 @@ def test_a_task_unknown_to_the_run_takes_the_tables_sentence(session, policy):
         texts(session, foreign, ("window-close",))
 
 
-def test_a_sentence_of_ones_own(session, policy, monkeypatch):
+def test_a_sentence_of_ones_own(session, policy, replace_module):
     asked = []
 
     def embed(sentences, encoder, weights):
@@ -92,8 +91,7 @@ def test_a_sentence_of_ones_own(session, policy, monkeypatch):
         return np.full((1, 384), 0.5, np.float32)
 
     fake = SimpleNamespace(embed=embed)
-    monkeypatch.setitem(sys.modules, "cmrl_jax.encoders", fake)
-    monkeypatch.setattr(cmrl_jax, "encoders", fake, raising=False)
+    replace_module("cmrl_jax.text.encoders", fake)
     found = texts(session, policy, text="shut it", weights=Path("w"))
     assert asked == [(["shut it"], "minilm-l6-v2", Path("w"))] and np.all(found == 0.5)
     fake.embed = lambda *args: np.zeros((1, 512), np.float32)
@@ -102,7 +100,7 @@ def test_a_sentence_of_ones_own(session, policy, monkeypatch):
 
 
 def test_a_sentence_without_an_encoder_is_two_lines(session, policy, monkeypatch):
-    monkeypatch.setitem(sys.modules, "cmrl_jax.encoders", None)
+    monkeypatch.setitem(sys.modules, "cmrl_jax.text.encoders", None)
     with pytest.raises(ConfigError, match="--text needs the sentence encoder minilm") as error:
         texts(session, policy, text="shut it")
     assert error.value.cure

@@ -12,13 +12,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from cmrl_jax import cli, evaluate_flags, finetune_flags, goals_cli, plot_flags, render_flags
-from cmrl_jax.cli import main
-from cmrl_jax.config import Config, ConfigError, leaves
-from cmrl_jax.config_io import load_config, to_yaml
-from envs import command_line, goal_sets, parity, picture
+from cmrl_jax.cli import evaluate_flags, finetune_flags, plot_flags, render_flags
+from cmrl_jax.cli import goals as goals_cli
+from cmrl_jax.cli import main as cli
+from cmrl_jax.cli.main import main
+from cmrl_jax.config.files import load_config, to_yaml
+from cmrl_jax.config.schema import Config, ConfigError, leaves
+from envs import command_line, goal_sets
 from envs.command_line import Parser, typed_path, what_is
 from envs.outputs import check_output
+from envs.parity import __main__ as parity
+from envs.render import picture
 
 PARSERS = {
     "train": cli.train_parser(),

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cmrl_jax.config import Config, ConfigError
-from cmrl_jax.config_io import load_config, read_yaml, resolve
-from cmrl_jax.goal_builder import read_prompts
-from cmrl_jax.yaml_tree import MAX_DEPTH, MAX_VALUES, read_tree
+from cmrl_jax.config.files import load_config, read_yaml, resolve
+from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.config.yaml_tree import MAX_DEPTH, MAX_VALUES, read_tree
+from cmrl_jax.text.goal_builder import read_prompts
 
 
 @pytest.fixture

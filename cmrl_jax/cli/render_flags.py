@@ -1,0 +1,74 @@
+"""Flags of `train.py render`, and every check of them that needs no jax."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+from typing import Any
+
+from cmrl_jax.cli.flags import add_force, episodes, goal_index, natural, seed, steps
+from cmrl_jax.config.files import run_config
+from cmrl_jax.config.rules import check_goal_set
+from cmrl_jax.config.schema import ConfigError, call_envs
+from cmrl_jax.storage.output_files import writable
+from cmrl_jax.storage.run_dir import find_run
+from envs.command_line import make_directory, typed_path, whole
+from envs.outputs import written_by
+
+DESCRIPTION = (
+    "Films one adaptation run per task in Meta-World's own scene: k exploration episodes, then the "
+    "reported one, as an mp4 and a contact sheet (PNG). Physics: MuJoCo C."
+)
+_PACKAGES = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
+
+
+def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """Adds the flags of `render`."""
+    add = parser.add_argument
+    add("--run", metavar="DIR", type=typed_path, required=True, help="run directory")
+    add("--k", type=episodes, metavar="N", help="exploration episodes [1; 0 without a latent z]")
+    add("--goal", type=goal_index, default=0, metavar="N", help="goal of the set, 0 to 49 [0]")
+    add("--goal-set", default="heldout", metavar="SET", help="train, heldout or fresh:<seed>")
+    add("--seed", type=seed, default=0, metavar="S", help="seed of the z draws [0]")
+    add("--horizon", type=steps, metavar="H", help="control steps an episode [env.horizon]")
+    add("--checkpoint", type=natural, metavar="N", help="iteration of the checkpoint [the last]")
+    add("--every", type=whole(1), default=4, metavar="N", help="control steps a video frame [4]")
+    add("--out", type=typed_path, metavar="DIR", help="where the files go [RUN/render]")
+    add_force(parser)
+    return parser
+
+
+def options_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of `render.render_run`; makes the output directory.
+
+    Raises:
+        ConfigError: no goal set or run, a package that is missing, or a directory that cannot be
+            written.
+    """
+    check_goal_set(args.goal_set, "--goal-set")
+    run = find_run(args.run)
+    config = run_config(run)
+    has_latent = config.model.conditioning == "z"
+    if args.k and not has_latent:
+        cause = f"--k {args.k} with model.conditioning {config.model.conditioning}"
+        raise ConfigError(cause, "give --k 0: only a latent z can adapt")
+    for module, package in _PACKAGES.items():
+        if importlib.util.find_spec(module) is None:
+            cause = f"render needs the package {package}, which is not installed"
+            raise ConfigError(cause, "pip install 'cmrl-jax[viz]'")
+    out = args.out or run / "render"
+    call_envs(lambda: make_directory(out, "--out"))
+    for task in config.tasks.train + config.tasks.test:
+        for ending in ("mp4", "png"):
+            writable(out / f"{task}.{ending}", "--out", written_by("render"), args.force)
+    return {
+        "run": run,
+        "k": args.k if args.k is not None else int(has_latent),
+        "goal": args.goal,
+        "goal_set": args.goal_set,
+        "seed": args.seed,
+        "horizon": args.horizon,
+        "checkpoint": args.checkpoint,
+        "every": args.every,
+        "out": out,
+    }

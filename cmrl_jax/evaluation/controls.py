@@ -1,0 +1,50 @@
+"""Controls of an evaluation: whose belief a lane's z is drawn from, and whose sentence it is given.
+
+They answer "is z used, is the text?": a policy whose score survives another lane's z does not use
+z. Both are defined on the tasks' own order (`envs.tasks.TASKS`), so that neither depends on the
+order in which tasks are evaluated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cmrl_jax.config.schema import TASKS
+
+_SHUFFLE_SEED = 0  # one derangement for everybody, so that runs are compared lane by lane
+
+
+def donors(z: str, lane_id: np.ndarray, env_task: np.ndarray) -> np.ndarray:
+    """The lane whose belief and text each lane's z is drawn from, (lane,) indices.
+
+    Args:
+        z: `shuffled` takes another lane of the whole evaluation, tasks mixed; `other` the same
+            goal and draw of the next task; every other source the lane itself.
+        lane_id: (lane,), each once.
+        env_task: (lane,).
+    """
+    own = np.arange(len(lane_id))
+    if z == "shuffled":
+        # A cycle through all lanes in random order: nobody is left with their own.
+        cycle = np.argsort(lane_id)[np.random.default_rng(_SHUFFLE_SEED).permutation(len(own))]
+        own[cycle] = np.roll(cycle, -1)
+    elif z == "other":
+        by_lane = np.lexsort((lane_id, env_task)).reshape(len(np.unique(env_task)), -1)
+        own[by_lane] = np.roll(by_lane, -1, axis=0)
+    return own
+
+
+def other_task(task: str) -> str:
+    """The task whose sentence `--text-control shuffled` gives in place of this one's."""
+    return TASKS[(TASKS.index(task) + 1) % len(TASKS)]
+
+
+def text_per_goal(vectors: Sequence[np.ndarray], goals: int) -> np.ndarray:
+    """Text vectors of each task's goals (task, goal, G): goal g takes sentence g mod n.
+
+    Args:
+        vectors: of each task, its sentences (n, G).
+    """
+    return np.stack([rows[np.arange(goals) % len(rows)] for rows in vectors]).astype(np.float32)

@@ -1,0 +1,334 @@
+"""Fine-tuning on a task that was held out: success against the policy's own experience there.
+
+One lane gathers episode after episode of the task, on goals of its own; gradient steps change what
+`adapt` allows, as many in the first episode as in every later one, so that after k episodes the
+ways that learn have made equally many. At the read-outs the policy is scored on a named goal set: z
+from the belief over all own transitions, no further adaptation. Normalisers stay those of training,
+and rewards are divided by the mean of the training tasks' denominators (algorithm.md 4.5, 5.6);
+`scratch` is SAC that knows nothing: its first episode has random actions, and it keeps statistics
+of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
+from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState, make_learner
+from cmrl_jax.algorithms.common.replay import ReplayState, stored_transitions
+from cmrl_jax.config.files import load_config
+from cmrl_jax.config.rules import validate
+from cmrl_jax.config.schema import Config
+from cmrl_jax.evaluation.episode import Episode, Lanes, PolicyParams, ZSource, make_episode
+from cmrl_jax.evaluation.finetune_options import FinetuneOptions
+from cmrl_jax.nn import normalizers
+from cmrl_jax.nn.context import Belief, ContextInference, init_belief, make_context_inference
+from cmrl_jax.nn.distributions import Gaussian
+from cmrl_jax.nn.optimizers import init_adam
+from envs.sawyer import Ml4Env
+from envs.tasks import task_id
+
+ROUTER_PARTS = ("embedding", "gating", "routing")  # names in networks.SoftModularNet begin so
+FREE_LATENT = "z"
+_NETWORKS = (
+    "actor_params",
+    "critic_params",
+    "target_critic_params",
+    "value_params",
+    "target_value_params",
+    "encoder_params",
+)
+
+
+class Score(NamedTuple):
+    """A read-out: means over its goals, and what went wrong until then.
+
+    Attributes:
+        faults: times a lane's physics was put back, mean over goals.
+        own_faults: times it was put back in the own episodes so far.
+        skipped: gradient steps so far that were dropped for a non-finite gradient.
+    """
+
+    success_any: float
+    success_last: float
+    returns: float
+    faults: float
+    own_faults: int = 0
+    skipped: int = 0
+
+
+def finetune_config(
+    config: Config, task: str, adapt: str, episodes: int, updates: int, denominator: float
+) -> Config:
+    """The configuration of one lane on one task.
+
+    Args:
+        config: the run's own.
+        adapt: see `finetune_options.ADAPT`.
+        updates: gradient steps per control step.
+        denominator: what rewards are divided by.
+
+    Raises:
+        ConfigError: a combination that `validate` refuses.
+    """
+    # Also from scratch: every way sees the observations of the run, in episodes and chunks as its.
+    env, chunk = config.env, config.collect.chunk
+    if adapt == "scratch":
+        batch = config.sac.batch
+        config = load_config("sac.yaml")
+        sac = replace(config.sac, batch=batch, n_step=min(config.sac.n_step, env.horizon))
+    else:
+        scale = config.sac.reward_scale / denominator
+        sac = replace(config.sac, reward_norm="none", reward_scale=scale, task_rows=0)
+    encoder = config.encoder
+    if encoder.aux == "contrastive":
+        encoder = replace(encoder, aux="none")  # one task alone has nothing to be told from
+    if adapt == "z":
+        # The latent stands alone: no encoder, and no decoder that its parameters would hold.
+        encoder = replace(encoder, information_bottleneck=False, aux="none")
+    collect = replace(
+        config.collect,
+        lanes=1,
+        chunk=chunk,
+        group_frac=(0.0, 0.0, 1.0),
+        updates_per_vector_step=updates,
+        initial="random" if adapt == "scratch" else "prior",
+        context_source="recent",
+        context_episodes=episodes,
+        context_lanes="all",
+    )
+    tuned = replace(
+        config,
+        env=env,
+        sac=sac,
+        encoder=encoder,
+        collect=collect,
+        tasks=replace(config.tasks, train=(task,), test=()),
+        train=replace(config.train, capacity=max(episodes * env.horizon, sac.batch)),
+    )
+    validate(tuned)
+    return tuned
+
+
+def free_latent(latent_dim: int) -> ContextInference:
+    """Inference whose posterior is one point, the parameter `z` (latent,), whatever was seen."""
+
+    def point(params: Any, lead: tuple[int, ...]) -> Gaussian:
+        mean = jnp.broadcast_to(params[FREE_LATENT], (*lead, latent_dim))
+        return Gaussian(mean, jnp.ones_like(mean))
+
+    return ContextInference(
+        latent_dim=latent_dim,
+        has_goal_factor=False,
+        posterior=lambda params, transitions, mask, goal=None, goal_mask=None: point(
+            params, mask.shape[:-1]
+        ),
+        update_belief=lambda params, belief, transitions, mask, goal=None, goal_mask=None: belief,
+        posterior_of_belief=lambda params, belief, goal=None, goal_mask=None: point(
+            params, belief.sums.count.shape
+        ),
+        z_of_noise=lambda gaussian, noise: gaussian.mean,
+        sample_z=lambda key, gaussian: gaussian.mean,
+    )
+
+
+def is_adapted(adapt: str, network: str, path: tuple[Any, ...]) -> bool:
+    """Whether gradient steps change a leaf of one of `_NETWORKS`."""
+    if adapt in ("all", "scratch"):
+        return True
+    if adapt == "z":
+        return network == "encoder_params"
+    if adapt == "router":
+        names = [str(getattr(key, "key", "")) for key in path]
+        is_router = any(name.startswith(ROUTER_PARTS) for name in names)
+        return is_router and network != "encoder_params"
+    return False  # posterior
+
+
+def restrict(learner: Learner, adapt: str) -> Learner:
+    """The learner with gradient steps that change only what `adapt` allows."""
+
+    def update(state: TrainState, replay_state: Any, context_state: Any, key: jax.Array):
+        if adapt == "posterior":
+            return state, {}
+        new, metrics = learner.update(state, replay_state, context_state, key)
+        kept = {
+            name: jax.tree_util.tree_map_with_path(
+                lambda path, new, old, name=name: new if is_adapted(adapt, name, path) else old,
+                getattr(new, name),
+                getattr(state, name),
+            )
+            for name in _NETWORKS
+        }
+        return replace(new, **kept), metrics
+
+    return replace(learner, update=update)
+
+
+def start_state(
+    adapt: str,
+    config: Config,
+    learner: Learner,
+    fresh: TrainState,
+    trained: TrainState,
+    text: jax.Array,
+) -> TrainState:
+    """A learner's first state, with what was trained in its place.
+
+    Args:
+        fresh: a first state of `learner`.
+        trained: the run's state, of any number of tasks.
+        text: text vector of the new task (G,).
+    """
+    if adapt == "scratch":
+        return jax.tree.map(jnp.copy, fresh)  # every leaf a buffer of its own, to be donated
+    kept = {name: getattr(trained, name) for name in _NETWORKS}
+    if adapt == "z":
+        # It begins where the sentence alone puts it, or at the prior's mean.
+        bottleneck = replace(config.encoder, information_bottleneck=True)
+        original = make_context_inference(replace(config, encoder=bottleneck), learner.networks)
+        belief = init_belief((), original.latent_dim)
+        posterior = original.posterior_of_belief(trained.encoder_params, belief, text, jnp.ones(()))
+        kept["encoder_params"] = {FREE_LATENT: posterior.mean}
+        fresh = replace(fresh, encoder_opt_state=init_adam(kept["encoder_params"]))
+    state = replace(
+        fresh,
+        **kept,
+        log_alpha=jnp.full_like(fresh.log_alpha, jnp.mean(trained.log_alpha)),
+        obs_stats=trained.obs_stats,
+    )
+    return jax.tree.map(jnp.copy, state)  # it is donated, the trained one is used again
+
+
+class FineTuning:
+    """One way to adapt on one task: its programs, and the run from episode to episode.
+
+    Args:
+        config: of `finetune_config`, for the way and its task.
+        adapt: one of `finetune_options.ADAPT`.
+        text: text vector of the task (G,).
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        adapt: str,
+        trained: TrainState,
+        text: np.ndarray,
+        options: FinetuneOptions,
+    ):
+        self.config = config
+        env_config = self.config.env
+        physics = options.physics or env_config.physics
+        self.env = Ml4Env(env_config.goal_observable, physics, env_config.obs_mode)
+        goals = jnp.asarray(text)[None, None]  # (task, paraphrase, G)
+        inference = None
+        if adapt == "z":
+            inference = free_latent(self.config.encoder.latent_dim)
+        learner = make_learner(self.config, goals, inference=inference)
+        self.learner = restrict(learner, adapt)
+        self.text, self.task = text, options.task
+        iteration = make_train_iteration(
+            self.config,
+            self.env,
+            self.learner,
+            goals,
+            None,
+            freeze_statistics=adapt != "scratch",
+            learn_at_once=True,
+        )
+        self.iteration = jax.jit(iteration, donate_argnums=0)
+        self.episode = jax.jit(
+            make_episode(self.config, self.env, self.learner, self.config.env.horizon)
+        )
+        run = init_run(self.config, learner, jax.random.key(options.seed))
+        first = start_state(adapt, self.config, learner, run.learner, trained, jnp.asarray(text))
+        self.run = run.replace(learner=first)
+        self.own_faults = 0
+
+    def gather(self) -> None:
+        """One own episode, with its gradient steps."""
+        self.run, metrics = self.iteration(self.run)
+        self.own_faults += int(metrics["physics_faults"])
+
+    def read_out(self, placements: np.ndarray, seed: int) -> Score:
+        """Success on goals (goal, 3), with the belief over all own transitions."""
+        goals, state = len(placements), self.run.learner
+        texts = np.broadcast_to(self.text, (1, goals, len(self.text)))
+        row = np.zeros(goals, np.int32)
+        belief = None
+        if self.learner.inference is not None:
+            own = own_belief(self.learner, state, self.run.context, jnp.asarray(self.text))
+            belief = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, goals, *x.shape[1:])), own)
+        first = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one policy
+        params = PolicyParams(
+            actor_params=first(state.actor_params),
+            encoder_params=first(state.encoder_params),
+            obs_stats=first(state.obs_stats),
+        )
+        _, scores = self.episode(
+            params,
+            belief,
+            texts,
+            ZSource(belief, texts, np.ones((1, goals), np.float32)),
+            Lanes(row + task_id(self.task), row, np.arange(goals, dtype=np.int32), placements),
+            np.bool_(True),
+            jax.random.key(seed),
+        )
+        skipped = int(state.skipped_updates)
+        return mean_score(scores)._replace(own_faults=self.own_faults, skipped=skipped)
+
+
+def mean_score(scores: Episode) -> Score:
+    """Means over all lanes."""
+    mean = lambda figure: float(np.mean(figure))
+    return Score(
+        success_any=mean(scores.success_any),
+        success_last=mean(scores.success_last),
+        returns=mean(scores.returns),
+        faults=mean(scores.faults),
+    )
+
+
+def own_belief(learner: Learner, state: TrainState, ring: ReplayState, text: jax.Array) -> Belief:
+    """The belief over every transition of a ring of one task, leading axis 1."""
+    inference = learner.inference
+    assert inference is not None
+    seen, mask = stored_transitions(ring)
+    seen = replace(
+        seen,
+        obs=learner.normalize_obs(state.obs_stats, seen.obs),
+        next_obs=learner.normalize_obs(state.obs_stats, seen.next_obs),
+    )
+    empty = init_belief((1,), inference.latent_dim)
+    return inference.update_belief(
+        state.encoder_params, empty, seen, mask, text[None], jnp.ones((1,))
+    )
+
+
+def adaptation_curve(
+    tuning: FineTuning,
+    options: FinetuneOptions,
+    placements: np.ndarray,
+    say: Callable[[int, Score], None],
+) -> dict[int, Score]:
+    """Scores at the read-outs, by episodes of own experience."""
+    curve = {}
+    for episode in range(options.episodes + 1):
+        if episode:
+            tuning.gather()
+        if episode in options.read_outs:
+            curve[episode] = tuning.read_out(placements, options.seed)
+            say(episode, curve[episode])
+    return curve
+
+
+def training_denominator(config: Config, state: TrainState) -> float:
+    """Mean of the training tasks' reward denominators: no statistic of the new task is used."""
+    return float(np.mean(normalizers.reward_denominator(state.return_stats, config.sac)))

@@ -1,0 +1,146 @@
+"""What a sweep scores: checkpoints, the program each needs, and the cells that are missing."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from cmrl_jax.config.schema import TASKS, Config, ConfigError, leaves
+from cmrl_jax.evaluation.cells import CellTable
+from cmrl_jax.evaluation.options import DONATED, EvalOptions, evaluated_tasks
+from cmrl_jax.evaluation.session import Policy, Session, load_policy
+from cmrl_jax.evaluation.settings import cell_columns, settings
+from cmrl_jax.evaluation.trials import evaluation_config
+from cmrl_jax.storage.checkpoint import policy_store
+
+
+@dataclass(frozen=True)
+class Target:
+    """One checkpoint to score."""
+
+    run: Path
+    checkpoint: int
+    config: Config
+    k: tuple[int, ...]
+    tasks: tuple[str, ...]
+
+
+def targets_of(
+    run: Path, checkpoints: tuple[int, ...] | Literal["all", "last"], options: EvalOptions
+) -> list[Target]:
+    """The chosen checkpoints of a run.
+
+    Raises:
+        ConfigError: it has none, or not those.
+    """
+    if options.physics == "metaworld":
+        raise ValueError("a sweep runs on mjx or native")
+    config = evaluation_config(run, options.physics)
+    with policy_store(run, read_only=True) as store:
+        steps = store.steps()
+    if not steps:
+        raise ConfigError(f"no policy checkpoint in {run}", "leave the run out of --runs")
+    if isinstance(checkpoints, tuple):
+        if missing := [step for step in checkpoints if step not in steps]:
+            there = ", ".join(map(str, steps))
+            raise ConfigError(f"{run} has no checkpoint {missing[0]}", f"there are: {there}")
+        steps = list(checkpoints)
+    elif checkpoints == "last":
+        steps = steps[-1:]
+    k = options.k if options.k is not None else config.eval.final_k
+    tasks = sorted(evaluated_tasks(options, config), key=TASKS.index)
+    return [Target(run, step, config, k, tuple(tasks)) for step in steps]
+
+
+def program_key(target: Target) -> str:
+    """Targets of one key are scored by one compiled program, and adapt equally often.
+
+    The key is the whole configuration less what is known not to act, so that a key of the schema
+    which nobody thought of here costs a compile, and never scores a policy as another's.
+    """
+    config = target.config
+    acting = [(name, value) for name, _, value in leaves(config) if not _is_idle(name)]
+    told = config.tasks.train if config.model.conditioning == "task_id" else ()
+    return repr((acting, told, target.k))
+
+
+IDLE = (
+    "name",
+    "seed",
+    "tasks.",  # told to a policy by `program_key`, where it is told them at all
+    "env.variation",  # an evaluation names its placements
+    "kl.",
+    "collect.lanes",
+    "collect.updates_per_vector_step",
+    "collect.group_frac",
+    "collect.noise_correlation",
+    "collect.noise_scale",
+    "collect.initial",
+    "collect.context_source",
+    "collect.context_episodes",
+    "collect.context_lanes",
+    "collect.own_context",
+    "sac.variant",
+    "sac.alpha",
+    "sac.alpha_init",
+    "sac.target_entropy",
+    "sac.gamma",
+    "sac.tau",
+    "sac.n_step",
+    "sac.reward_scale",
+    "sac.reward_norm",
+    "sac.return_max",
+    "sac.task_reduce",
+    "sac.loss_balance",
+    "sac.policy_reg",
+    "sac.batch",
+    "sac.task_rows",
+    "sac.lr",
+    "sac.grad_clip",
+    "train.",
+    "eval.",  # an evaluation has options of its own; k is part of the key
+    "checkpoint.",
+    "log.",
+    "runtime.compile_cache",
+)
+"""Keys, and with a dot whole sections, that training reads and a policy that acts does not."""
+
+
+def _is_idle(name: str) -> bool:
+    return name in IDLE or any(name.startswith(x) for x in IDLE if x.endswith("."))
+
+
+def cells_per_task(target: Target, options: EvalOptions) -> int:
+    return options.goals * options.draws * len(target.k)
+
+
+def pending_tasks(target: Target, options: EvalOptions, table: CellTable) -> tuple[str, ...]:
+    """The tasks of a target with a cell that is not in the table.
+
+    Where a lane's z is another lane's, an evaluation is whole or it is another evaluation.
+    """
+    common = columns_of(target, options)
+
+    def is_done(task: str) -> bool:
+        cells = itertools.product(range(options.goals), range(options.draws), target.k)
+        return all(
+            table.holds(common | {"task": task, "goal": goal, "draw": draw, "k": k})
+            for goal, draw, k in cells
+        )
+
+    pending = tuple(task for task in target.tasks if not is_done(task))
+    return target.tasks if pending and options.z in DONATED else pending
+
+
+def columns_of(target: Target, options: EvalOptions) -> dict[str, Any]:
+    """The columns that name a target's cells."""
+    cell = cell_columns(target.run, target.checkpoint)
+    return cell | settings(options, target.config)
+
+
+def load_target(target: Target, session: Session) -> Policy:
+    """The policy of a target, read with the session of its program."""
+    tasks = target.config.tasks.train + target.config.tasks.test
+    return load_policy(target.run, session, target.checkpoint, tasks)

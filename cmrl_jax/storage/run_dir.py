@@ -1,0 +1,189 @@
+"""Which directory a run writes to: a new `runs/<config>-<time>`, or the one that is resumed.
+
+A directory holds a run from the moment one of `RUN_FILES` lies in it. One process at a time writes
+to it: it holds a lock that the system releases when the process ends, however it ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import os
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+from cmrl_jax.commands import command, quoted
+from cmrl_jax.config.schema import ConfigError, call_envs
+from cmrl_jax.storage.locks import lock
+from envs.command_line import brief, what_is
+
+RUN_FILES = ("config.yaml", "metrics.csv", "ckpt")
+ROOT = Path("runs")
+LOCK = ".lock"
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO)
+_TIME = r"\d{8}-\d{6}(-\d+)?"
+
+
+def holds_run(path: Path) -> bool:
+    """Whether a run has begun to write into `path`; no, where that cannot be looked at."""
+    return any(os.path.exists(path / name) for name in RUN_FILES)
+
+
+def config_stem(path: Path) -> str:
+    """What runs of a config file are called: `ml4` for configs/ml4.yaml.
+
+    A run's own `runs/ml4-<time>/config.yaml` belongs to `ml4` too.
+    """
+    if path.name == "config.yaml" and holds_run(path.parent):
+        return re.sub(f"-{_TIME}$", "", path.resolve().parent.name)
+    return path.stem
+
+
+def runs_of(stem: str, root: Path = ROOT) -> list[Path]:
+    """Run directories of a config, oldest first."""
+    name = re.compile(f"{re.escape(stem)}-{_TIME}")
+    found = [p for p in root.glob("*") if name.fullmatch(p.name) and holds_run(p)]
+    return sorted(found, key=_age)
+
+
+def _age(path: Path) -> tuple[str, int]:
+    """Sorts `x-20260102-030405-2` behind `x-20260102-030405`."""
+    match = re.search(r"(\d{8}-\d{6})(?:-(\d+))?$", path.name)
+    assert match is not None  # runs_of matched the name
+    return match[1], int(match[2] or 0)
+
+
+def find_run(path: Path) -> Path:
+    """`path`, if it holds a run.
+
+    Raises:
+        ConfigError: naming the runs that are there, or why nothing can be said of `path`.
+    """
+    call_envs(lambda: what_is(path / RUN_FILES[0]))
+    if holds_run(path):
+        return path
+    known = [quoted(p) for p in sorted(ROOT.glob("*")) if holds_run(p)][-5:]
+    state = "holds no run" if path.is_dir() else "does not exist"
+    train = f"train first: {command('--config', 'ml4.yaml')}"
+    cure = f"give --run one of: {', '.join(known)}" if known else train
+    raise ConfigError(f"run directory {brief(path)} {state}", cure)
+
+
+def resumed_run(stem: str, run: Path | None) -> Path:
+    """The directory to resume: `run`, or the newest one of the config.
+
+    Raises:
+        ConfigError: where there is none.
+    """
+    if run is not None:
+        return find_run(run)
+    runs = runs_of(stem)
+    if not runs:
+        cause = f"--resume found no run of '{stem}' in {ROOT}/"
+        raise ConfigError(cause, "name it with --run DIR, or start one without --resume")
+    return runs[-1]
+
+
+def new_run(stem: str, run: Path | None, now: datetime.datetime | None = None) -> Path:
+    """Makes the directory of a new run: `run`, or `runs/<stem>-<time>`.
+
+    Raises:
+        ConfigError: where it holds a run already, or cannot be made.
+    """
+    try:
+        if run is None:
+            time = (now or datetime.datetime.now()).strftime("%Y%m%d-%H%M%S")
+            run = ROOT / f"{stem}-{time}"
+            return _made(run)
+        check_unused(run)
+        run.mkdir(parents=True, exist_ok=True)
+        return run
+    except OSError as error:
+        assert run is not None
+        raise cannot_write(run, error) from error
+
+
+def _made(base: Path) -> Path:
+    """A directory that was not there before: `base`, or `base-<n>`.
+
+    Who makes it has it, so that of many starts in one second each gets its own.
+    """
+    base.parent.mkdir(parents=True, exist_ok=True)
+    run, copy = base, 0
+    while True:
+        try:
+            run.mkdir()
+            return run
+        except FileExistsError:
+            copy += 1
+            run = base.with_name(f"{base.name}-{copy}")
+
+
+def check_unused(run: Path) -> None:
+    """Raises ConfigError where a directory holds a run already."""
+    call_envs(lambda: what_is(run / RUN_FILES[0]))
+    if holds_run(run):
+        cause = f"run directory {run} already holds a run"
+        raise ConfigError(cause, "add --resume to go on with it, or give another --run DIR")
+
+
+def forget_unbegun(run: Path) -> None:
+    """Takes `config.yaml` back from a run that was refused before it wrote anything else.
+
+    So the same command can be given again, once what it was refused for is mended.
+    """
+    if not any((run / name).exists() for name in RUN_FILES if name != "config.yaml"):
+        (run / "config.yaml").unlink(missing_ok=True)
+
+
+def cannot_write(run: Path, error: OSError) -> ConfigError:
+    """What to tell a user whose run directory refuses a write."""
+    cause = f"cannot write to run directory {run}: {error.strerror}"
+    if error.errno in DISK_FULL:
+        resume = command("--run", run, "--resume")
+        return ConfigError(cause, f"make room, then go on from the last checkpoint: {resume}")
+    return ConfigError(cause, "give a directory you may write to: --run DIR")
+
+
+@contextlib.contextmanager
+def writing_to(run: Path) -> Iterator[None]:
+    """Keeps every other process from writing to `run`, and reports what its disk refuses.
+
+    Raises:
+        ConfigError: another process writes to it, or a write failed.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(open(run / LOCK, "a+", encoding="utf-8"))
+            lock(file, f"run directory {run}")
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}")
+            file.flush()
+        except BlockingIOError as error:
+            file.seek(0)
+            cause = f"{file.read() or 'another process'} is writing to run directory {run}"
+            raise ConfigError(cause, "stop it first, or give another --run DIR") from error
+        except OSError as error:
+            raise cannot_write(run, error) from error
+        try:
+            yield
+        except OSError as error:
+            if error.errno in (*DISK_FULL, *REFUSED) and _is_inside(error.filename, run):
+                raise cannot_write(run, error) from error
+            raise
+
+
+def _is_inside(name: str | bytes | None, run: Path) -> bool:
+    """Whether an error is about a file of `run`; one without a name came from a write to it."""
+    return name is None or Path(os.fsdecode(name)).resolve().is_relative_to(run.resolve())
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replaces a file as a whole: a kill leaves the old one or the new one, never a part."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
