@@ -133,9 +133,9 @@ FILM = """
 import sys
 import numpy as np
 from cmrl_jax.evaluation.evaluator import Evaluator
-from cmrl_jax.film import Camera, Episode, Film, write_sheet, write_video
+from cmrl_jax.analysis.film import Camera, Episode, Film, write_sheet, write_video
 from envs.goal_sets import load_goal_set
-from envs.reference import record_rollout
+from envs.parity.reference import record_rollout
 from pathlib import Path
 out, goal = Path(sys.argv[1]), load_goal_set("heldout", ("window-open",))[0, 0]
 episodes = []

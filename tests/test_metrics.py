@@ -16,7 +16,8 @@ from run_helpers import csv_points, tensorboard_points
 from cmrl_jax import formats
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.storage import versions
-from cmrl_jax.training import metrics
+from cmrl_jax.training import loggers, metrics
+from cmrl_jax.training.loggers import Progress, RunInfo
 
 COLUMNS = (*metrics.LEADING_COLUMNS, "train/critic_loss", "eval/drawer-open/k0/success_any")
 
@@ -126,21 +127,25 @@ def test_columns_and_rows_are_checked(tmp_path):
 
 def test_tensorboard_events_hold_the_figures(tmp_path):
     pytest.importorskip("tensorboardX")
-    sink = metrics.TensorBoard(tmp_path)
-    sink.write(make_row(3, **{"train/critic_loss": jnp.float32(0.25), "train/absent": None}))
+    sink = loggers.TensorBoard()
+    sink.start(RunInfo(tmp_path, ()))
+    row = make_row(3, **{"train/critic_loss": jnp.float32(0.25), "train/absent": None})
+    sink.row(row, Progress(0.5, 1.0))
     sink.close()
-    assert tensorboard_points(tmp_path) == [(30, "train/critic_loss", 0.25)]
+    assert tensorboard_points(tmp_path / "tensorboard") == [(30, "train/critic_loss", 0.25)]
 
 
 def test_a_killed_process_leaves_every_row_in_tensorboard(tmp_path):
     pytest.importorskip("tensorboardX")
     script = "import os, sys; from pathlib import Path\n"
-    script += "from cmrl_jax.training.metrics import TensorBoard\n"
-    script += "sink = TensorBoard(Path(sys.argv[1]))\n"
+    script += "from cmrl_jax.training.loggers import Progress, RunInfo, TensorBoard\n"
+    script += "sink = TensorBoard(); sink.start(RunInfo(Path(sys.argv[1]), ()))\n"
     script += "row = {'env_steps': 10, 'wall_s': 0.5} | {f'train/{i}': i for i in range(40)}\n"
-    script += "sink.write(row); os._exit(0)"
+    script += "sink.row(row, Progress(0.5, 1.0)); os._exit(0)"
     subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
-    assert tensorboard_points(tmp_path) == sorted((10, f"train/{i}", i) for i in range(40))
+    assert tensorboard_points(tmp_path / "tensorboard") == sorted(
+        (10, f"train/{i}", i) for i in range(40)
+    )
 
 
 def test_a_resumed_file_and_tensorboard_have_every_row_once(tmp_path):
@@ -151,12 +156,13 @@ def test_a_resumed_file_and_tensorboard_have_every_row_once(tmp_path):
     def process(iterations, offset=None):
         """Writes rows as one process does; returns the length of the CSV after each."""
         csv = metrics.MetricsCsv(path, COLUMNS, offset)
-        board = metrics.TensorBoard(tmp_path, csv.rows())
+        board = loggers.TensorBoard()
+        board.start(RunInfo(tmp_path, (), csv.rows()))
         offsets = []
         for iteration in iterations:
             row = make_row(iteration, **{figure: 0.1 * iteration})
             csv.write(row)
-            board.write(row)
+            board.row(row, Progress(0.5, 1.0))
             offsets.append(csv.offset)
         csv.close()
         board.close()
@@ -165,13 +171,13 @@ def test_a_resumed_file_and_tensorboard_have_every_row_once(tmp_path):
     offsets = process((0, 1, 2))
     process((2, 3), offset=offsets[1])
     expected = [(10 * i, figure, float(np.float32(0.1 * i))) for i in range(4)]
-    assert tensorboard_points(tmp_path) == csv_points(path) == expected
+    assert tensorboard_points(tmp_path / "tensorboard") == csv_points(path) == expected
 
 
 def test_missing_tensorboard_names_its_cure(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(ConfigError) as raised:
-        metrics.TensorBoard(tmp_path)
+        loggers.TensorBoard()
     assert "tensorboardX" in raised.value.cause and "pip install" in raised.value.cure
 
 
@@ -197,12 +203,12 @@ def test_the_console_line_shows_each_figure_once():
         "train/routing_entropy": 0.98,
         "time/env_steps_per_s": 4123.4,
     }
-    assert metrics.format_iteration(row, tasks, 187.0) == (
+    assert loggers.format_iteration(row, tasks, 187.0) == (
         "iter   12     460,800 steps | success drawer-open 0.25 drawer-close 1.00 | "
         "return drawer-open 512 drawer-close 1830 | critic 0.0123  KL 3.50 nats  routing 0.98 | "
         "4,123 steps/s | ETA 3m07s"
     )
-    assert metrics.format_iteration(make_row(0), tasks, math.inf) == (
+    assert loggers.format_iteration(make_row(0), tasks, math.inf) == (
         "iter    0           0 steps | ETA ?"
     )
 
@@ -216,8 +222,8 @@ def test_the_evaluation_line_groups_by_task():
         "eval/window-open/k2/success_any": None,
     }
     expected = "evaluation | drawer-open k0 0.50 k2 0.75 | window-close k2 0.00"
-    assert metrics.format_evaluation(row) == expected
-    assert metrics.format_evaluation(make_row(1)) is None
+    assert loggers.format_evaluation(row) == expected
+    assert loggers.format_evaluation(make_row(1)) is None
 
 
 class Terminal(io.StringIO):
@@ -227,9 +233,8 @@ class Terminal(io.StringIO):
 
 def test_a_progress_bar_is_drawn_on_a_terminal_only():
     def show(stream: io.StringIO, progress: bool) -> str:
-        console = metrics.Console(progress, stream)
-        console.line("a line [with] brackets")
-        console.advance(0.5)
+        console = loggers.Console(progress, stream)
+        console.message("a line [with] brackets")
         console.close()
         return stream.getvalue()
 

@@ -33,6 +33,7 @@ from run_helpers import (
 
 from cmrl_jax.cli import main as cli
 from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.storage import run_dir
 from cmrl_jax.storage.run_dir import LOCK, new_run, writing_to
 
 
@@ -182,7 +183,7 @@ def test_ctrl_c_ends_a_command_without_a_traceback(monkeypatch, capfd, error):
 
 STARTS = """
 import datetime, multiprocessing, sys
-from cmrl_jax.run_dir import new_run
+from cmrl_jax.storage.run_dir import new_run
 
 def start(barrier, queue):
     for second in range(ROUNDS):
@@ -234,7 +235,7 @@ def test_a_run_that_came_before_the_lock_is_not_overwritten(
         with writing_to(path):
             yield
 
-    monkeypatch.setattr(cli, "writing_to", late)
+    monkeypatch.setattr(run_dir, "writing_to", late)
     assert "already holds a run" in refused("--config", "smoke.yaml", "--run", str(run))[0]
     assert all((run / f).read_bytes() == (undisturbed / f).read_bytes() for f in files)
 

@@ -37,8 +37,10 @@ ROOMS = (
     "training",
     "analysis",
     "bench",
+    "api",
     "cli",
     "",
+    "__main__",
 )
 # Read and checked before jax is imported.
 LIGHT = {
@@ -51,12 +53,12 @@ LIGHT = {
     "storage.output_files",
     "text.goal_files",
     *(f"evaluation.{name}" for name in ("options", "finetune_options", "cells")),
-    *(f"cli.{name}" for name in ("main", "flags", "goals")),
+    *(f"cli.{name}" for name in ("main", "train", "stop_signal", "flags", "goals")),
     *(f"cli.{name}_flags" for name in ("evaluate", "render", "finetune", "plot")),
 }
 LIGHT_OF_ENVS = {"command_line", "goal_names", "outputs"}  # what those take from envs
 # Light ones whose commands import the programs they run.
-COMMANDS = {"cli.main", "cli.evaluate_flags", "cli.goals"}
+COMMANDS = {"cli.main", "cli.train", "cli.evaluate_flags", "cli.goals"}
 
 
 def room(name: str) -> int:

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cmrl_jax.cli import evaluate_flags, finetune_flags, plot_flags, render_flags
+from cmrl_jax.cli import evaluate_flags, finetune_flags, plot_flags, render_flags, train
 from cmrl_jax.cli import goals as goals_cli
 from cmrl_jax.cli import main as cli
 from cmrl_jax.cli.main import main
@@ -25,7 +25,7 @@ from envs.parity import __main__ as parity
 from envs.render import picture
 
 PARSERS = {
-    "train": cli.train_parser(),
+    "train": train.train_parser(),
     "eval": evaluate_flags.eval_parser(),
     "sweep": evaluate_flags.sweep_parser(),
     "bench": cli.bench_parser(),

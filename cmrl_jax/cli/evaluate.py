@@ -7,12 +7,10 @@ from typing import Any
 
 from cmrl_jax.config.schema import call_envs
 from cmrl_jax.evaluation.cells import CellTable, Row
-from cmrl_jax.evaluation.evaluator import Evaluator
-from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks
-from cmrl_jax.evaluation.scores import cell_rows, format_scores, of_policy, summarise
+from cmrl_jax.evaluation.options import EvalOptions
+from cmrl_jax.evaluation.results import score
 from cmrl_jax.evaluation.session import Session, load_policy, prepare_jax
-from cmrl_jax.evaluation.settings import describe, result_fields, row_columns
-from cmrl_jax.evaluation.trials import batch_lanes, evaluation_config, lane_budget, trial_of
+from cmrl_jax.evaluation.trials import evaluation_config
 from envs.outputs import write_json
 
 
@@ -57,15 +55,7 @@ def _evaluate(
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
     policy = load_policy(run, session, checkpoint)
-    tasks = evaluated_tasks(options, config)
-    trial = trial_of([policy], session, options, tasks)
-    unit = config.eval.goals * len(session.eval_tasks)
-    lanes = batch_lanes(len(tasks) * options.goals * options.draws, unit, lane_budget(options))
-    evaluator = Evaluator(config, session.env, session.learner, lanes, options.horizon)
-    k = options.k if options.k is not None else config.eval.final_k
-    scores = of_policy(evaluator.run([policy.params], trial, k, options.seed), 0)
-    summary = summarise(scores, tasks)
-    print(f"checkpoint {policy.meta['iteration']} of {run}: {describe(options, config)}")
-    print(format_scores(summary))
-    result = {"tasks": summary} | result_fields(run, policy.meta, options, config)
-    return result, cell_rows(scores, tasks, row_columns(run, policy.meta, options, config))
+    found = score(run, session, policy, options)
+    print(f"checkpoint {policy.meta['iteration']} of {run}: {found.setting}")
+    print(found.table())
+    return found.as_json(), found.cells

@@ -24,13 +24,18 @@ from cmrl_jax.cli.flags import (
     seed,
     steps,
 )
-from cmrl_jax.commands import shown
-from cmrl_jax.config.rules import check_goal_set
-from cmrl_jax.config.schema import MOST_EPISODES, TASKS, ConfigError, suggest
-from cmrl_jax.evaluation.options import DONATED, MOST_DRAWS, Z_SOURCES, EvalOptions, check_run
+from cmrl_jax.config.schema import MOST_EPISODES, ConfigError
+from cmrl_jax.evaluation.options import (
+    DONATED,
+    MOST_DRAWS,
+    Z_SOURCES,
+    EvalOptions,
+    check_options,
+    check_run,
+)
 from cmrl_jax.storage.output_files import distinct, writable
 from cmrl_jax.storage.run_dir import holds_run
-from envs.command_line import brief, typed_path, what_is, whole
+from envs.command_line import brief, typed_path, whole
 from envs.goal_names import GOALS
 from envs.outputs import written_by
 
@@ -139,33 +144,6 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
     Raises:
         ConfigError: a value out of range, an unknown name, or flags that contradict each other.
     """
-    check_goal_set(args.goal_set, "--goal-set")
-    for task in args.tasks or ():
-        if task not in TASKS:
-            cure = f"{suggest(task, TASKS)}valid: {', '.join(TASKS)}"
-            raise ConfigError(f"unknown task '{task}' in --tasks", cure)
-    for flag, values in (("tasks", args.tasks), ("k", args.k)):
-        if values is not None and (not values or len(set(values)) < len(values)):
-            raise ConfigError(f"--{flag} is '{shown(values)}'", "name at least one, each once")
-    changed = [
-        flag
-        for flag, value, default in (
-            ("--paraphrases", args.paraphrases, "train"),
-            ("--text-control", args.text_control, "none"),
-        )
-        if value != default
-    ]
-    if args.text is not None and not args.text.strip():
-        cure = "write a sentence, or --text-control zero for a policy that is told nothing"
-        raise ConfigError("--text is empty", cure)
-    if args.text is not None and changed:
-        raise ConfigError(f"--text with {changed[0]}", "give one of the two: each names the text")
-    if args.weights is not None and what_is(args.weights) != "directory":
-        cause = f"--weights {brief(args.weights)} is no directory"
-        raise ConfigError(cause, "give the one that holds the text encoder's model")
-    if args.physics == "metaworld" and args.z in DONATED:
-        cause = f"--z {args.z} with --physics metaworld, where lanes know nothing of each other"
-        raise ConfigError(cause, "use --z posterior, prior or text, or --physics native")
     own = {}
     for name in ("adaptation_episodes", "evaluation_episodes"):
         if (value := getattr(args, name, None)) is not None:
@@ -173,7 +151,7 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
             if args.physics != "metaworld":
                 raise ConfigError(f"{flag} without --physics metaworld", "leave it out")
             own[name] = value
-    return EvalOptions(
+    options = EvalOptions(
         **own,
         k=args.k,
         tasks=args.tasks,
@@ -192,6 +170,8 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
         any_table=args.any_table,
         lanes=args.lanes,
     )
+    check_options(options)
+    return options
 
 
 def find_runs(patterns: Sequence[str]) -> list[Path]:

@@ -16,6 +16,9 @@ from envs.command_line import Parser, whole
 from envs.goal_names import GOALS, LARGEST_SEED
 from envs.outputs import FORCE_HELP
 
+# `train` is what is meant where none is named.
+COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "goals")
+
 
 def parser_of(command: str, description: str) -> Parser:
     """An empty parser of a command, which says how this program was started."""

@@ -9,47 +9,27 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import signal
 import sys
-import typing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from cmrl_jax import streams
-from cmrl_jax.cli import evaluate_flags, finetune_flags, plot_flags, render_flags
-from cmrl_jax.cli.flags import Parser, add_force, names, parse, parser_of
-from cmrl_jax.commands import program, shown
+from cmrl_jax.cli import evaluate_flags, finetune_flags, plot_flags, render_flags, train
+from cmrl_jax.cli.flags import COMMANDS, add_force, names, parse, parser_of
 from cmrl_jax.config.files import (
-    check_resumable,
-    config_dirs,
-    field_types,
-    find_config,
-    read_yaml,
-    resolve,
     run_config,
-    to_yaml,
 )
-from cmrl_jax.config.schema import Config, ConfigError, call_envs, leaves, suggest
+from cmrl_jax.config.schema import ConfigError, call_envs, suggest
 from cmrl_jax.evaluation import finetune_options
-from cmrl_jax.stop import StopSignal, is_interrupt
+from cmrl_jax.stop import is_interrupt
 from cmrl_jax.storage.output_files import distinct, writable
 from cmrl_jax.storage.run_dir import (
-    check_unused,
-    config_stem,
     find_run,
-    forget_unbegun,
-    new_run,
-    resumed_run,
-    write_text,
-    writing_to,
 )
-from cmrl_jax.text.goal_files import find_table
 from envs.command_line import typed_path
 from envs.outputs import written_by
-
-COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "goals")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -109,7 +89,7 @@ def _dispatch(words: list[str]) -> int:
         cure = f"{near}commands: {', '.join(COMMANDS)}; train needs --config ml4.yaml"
         raise ConfigError(f"unknown command '{command}'", cure)
     run = {
-        "train": _train,
+        "train": train.run_train,
         "eval": evaluate_flags.run_eval,
         "sweep": evaluate_flags.run_sweep,
         "finetune": _finetune,
@@ -119,87 +99,6 @@ def _dispatch(words: list[str]) -> int:
         "goals": _goals,
     }
     return run[command](words)
-
-
-def train_parser() -> argparse.ArgumentParser:
-    """Flags of `train`: one for each leaf of the config schema, with its text and default."""
-    parser = Parser(
-        prog=program(),
-        usage="%(prog)s --config X.yaml [--section.key VALUE ...] [--run DIR] [--resume]",
-        description="Meta-trains on the tasks of a YAML config, in one process, on any device.",
-        epilog=f"commands: {', '.join(COMMANDS)}; each has its own --help",
-        allow_abbrev=False,
-    )
-    parser.add_argument(
-        "--config", metavar="X.yaml", type=typed_path, help="a file, or a name in configs/"
-    )
-    parser.add_argument("--run", metavar="DIR", type=typed_path, help="run directory [runs/X-TIME]")
-    parser.add_argument(
-        "--resume", action="store_true", help="go on with --run DIR, or with the newest run of X"
-    )
-    groups = {"": parser.add_argument_group("config: defaults < YAML < these flags")}
-    for name, f, default in leaves(Config()):
-        section = name.rpartition(".")[0]
-        if section not in groups:
-            groups[section] = parser.add_argument_group(section)
-        text = f"{f.metadata['doc']} [{shown(default)}]".replace("%", "%%")
-        groups[section].add_argument(
-            f"--{name}", metavar=_metavar(default, f, name), default=argparse.SUPPRESS, help=text
-        )
-    return parser
-
-
-def _metavar(default: Any, f: Any, name: str) -> str:
-    owner: Any = Config
-    for section in name.split(".")[:-1]:
-        owner = field_types(owner)[section]
-    hint = field_types(owner)[f.name]
-    if typing.get_origin(hint) is Literal:
-        return "|".join(typing.get_args(hint))
-    if typing.get_origin(hint) is tuple:
-        return "A,B,.."
-    return {bool: "true|false", int: "N", float: "X", str: "TEXT"}[type(default)]
-
-
-def _train(words: list[str]) -> int:
-    args = vars(parse(train_parser(), words))
-    name, run, resume = args.pop("config"), args.pop("run"), args.pop("resume")
-    if name is None and run is not None and resume:
-        name = find_run(run) / "config.yaml"
-    if name is None:
-        found = sorted({p.name for d in config_dirs()[1:] for p in d.glob("*.yaml")})
-        raise ConfigError("no --config given", f"add --config with one of: {', '.join(found)}")
-    path = find_config(name)
-    config = resolve(*read_yaml(path), flags=args)
-    _check_extras(config)
-    if resume:
-        run = resumed_run(config_stem(path), run)
-        if (run / "config.yaml").is_file():
-            check_resumable(read_yaml(run / "config.yaml")[0], config, run)
-    else:
-        run = new_run(config_stem(path), run)
-    with writing_to(run):
-        if not resume:
-            check_unused(run)  # once more: another process may have come and gone
-        write_text(run / "config.yaml", to_yaml(config))  # from here on it can be resumed
-        stop = StopSignal()  # before the imports that take seconds
-        try:
-            from cmrl_jax.training import trainer
-
-            return trainer.train(config=config, run_dir=run, stop=stop, resume=resume)
-        except ValueError:  # a ConfigError is one
-            if not resume:
-                forget_unbegun(run)
-            raise
-        finally:
-            stop.restore()
-
-
-def _check_extras(config: Config) -> None:
-    find_table(config.goals.table)
-    if config.log.tensorboard and importlib.util.find_spec("tensorboardX") is None:
-        cause = "log.tensorboard needs the package tensorboardX, which is not installed"
-        raise ConfigError(cause, "pip install 'cmrl-jax[viz]', or set log.tensorboard: false")
 
 
 def _plot(words: list[str]) -> int:

@@ -63,22 +63,30 @@ class _Source:
         return f" ({self.name}:{line})" if line else f" ({self.name})"
 
 
-def load_config(name: str | Path, flags: Mapping[str, str] | None = None) -> Config:
-    """The validated config of a YAML file, found by `find_config`, under dotted flags.
+def load_config(
+    name: str | Path, overrides: Mapping[str, Any] | None = None, seed: int | None = None
+) -> Config:
+    """The validated config of a YAML file.
+
+    Args:
+        name: a file, or the name of one in `configs/`, with or without its ending: `ml4`.
+        overrides: values by dotted key, `{"sac.batch": 64}`; text is read as the flag's would be.
+        seed: the same as an override of `seed`.
 
     Raises:
         ConfigError: a missing file, a key or value that the schema refuses, a broken rule.
     """
-    return resolve(*read_yaml(find_config(name)), flags=flags)
+    overrides = dict(overrides or {}) | ({} if seed is None else {"seed": seed})
+    return resolve(*read_yaml(find_config(name)), flags=overrides)
 
 
 def resolve(
-    data: Mapping[str, Any], source: _Source | None = None, flags: Mapping[str, str] | None = None
+    data: Mapping[str, Any], source: _Source | None = None, flags: Mapping[str, Any] | None = None
 ) -> Config:
-    """The validated config of plain YAML data under dotted flags, each flag a string."""
+    """The validated config of plain YAML data under values by dotted key, text or typed."""
     config = from_dict(data, source)
-    for dotted, text in (flags or {}).items():
-        config = _replace(config, dotted, text)
+    for dotted, value in (flags or {}).items():
+        config = _replace(config, dotted, value)
     validate(config)
     return config
 
@@ -183,8 +191,9 @@ def find_config(name: str | Path) -> Path:
         ConfigError: listing the configs that were found instead.
     """
     for folder in config_dirs():
-        if (folder / name).is_file():
-            return folder / name
+        for file in (folder / name, folder / f"{name}.yaml"):
+            if file.is_file():
+                return file
     found = sorted({p.name for d in config_dirs()[1:] if d.is_dir() for p in d.glob("*.yaml")})
     close = suggest(Path(name).name, found)
     raise ConfigError(f"config '{name}' not found", f"{close}found: {', '.join(found) or 'none'}")
@@ -235,14 +244,24 @@ def _names(cls: type) -> list[str]:
     return [f.name for f in fields(cls)]
 
 
-def _replace(config: Config, dotted: str, text: str) -> Config:
-    """`config` with one leaf set from the text of its flag."""
+def _replace(config: Config, dotted: str, value: Any) -> Config:
+    """`config` with one leaf set, from the text of its flag or from a value of its type.
+
+    Raises:
+        ConfigError: no such key, or a value that it cannot have.
+    """
     data: Any = to_dict(config)
     owner, cls = data, Config
     *sections, key = dotted.split(".")
     for section in sections:
+        if not is_dataclass(field_types(cls).get(section)):
+            _unknown(section, dotted, cls, "")
         owner, cls = owner[section], field_types(cls)[section]
-    owner[key] = parse_flag(text, field_types(cls)[key], dotted)
+    hint = field_types(cls).get(key)
+    if hint is None or is_dataclass(hint):
+        _unknown(key, dotted, cls, "")
+    is_text = isinstance(value, str)
+    owner[key] = parse_flag(value, hint, dotted) if is_text else _leaf(value, hint, dotted, "")
     return from_dict(data, _Source())
 
 

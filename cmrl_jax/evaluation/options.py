@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import typing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from cmrl_jax.commands import shown
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.config.rules import check_goal_set
+from cmrl_jax.config.schema import (
+    MOST_EPISODES,
+    MOST_STEPS,
+    TASKS,
+    Config,
+    ConfigError,
+    suggest,
+)
 from cmrl_jax.storage.run_dir import find_run
-from envs.goal_names import GOALS
+from envs.command_line import LARGEST, brief, what_is
+from envs.goal_names import GOALS, LARGEST_SEED
 
 Z_SOURCES = ("posterior", "prior", "shuffled", "other", "text")
 
@@ -65,6 +75,71 @@ class EvalOptions:
     lanes: int | None = None
     adaptation_episodes: int = 10
     evaluation_episodes: int = 3
+
+
+def check_options(options: EvalOptions) -> None:
+    """Whether the options are such as some run could be evaluated by.
+
+    Raises:
+        ConfigError: a value out of range, an unknown name, or options that contradict each other.
+    """
+    _check_values(options)
+    check_goal_set(options.goal_set, "--goal-set")
+    for task in options.tasks or ():
+        if task not in TASKS:
+            cure = f"{suggest(task, TASKS)}valid: {', '.join(TASKS)}"
+            raise ConfigError(f"unknown task '{task}' in --tasks", cure)
+    for flag, values in (("tasks", options.tasks), ("k", options.k)):
+        if values is not None and (not values or len(set(values)) < len(values)):
+            raise ConfigError(f"--{flag} is '{shown(values)}'", "name at least one, each once")
+    changed = [
+        flag
+        for flag, value, default in (
+            ("--paraphrases", options.paraphrases, "train"),
+            ("--text-control", options.text_control, "none"),
+        )
+        if value != default
+    ]
+    if options.text is not None and not options.text.strip():
+        cure = "write a sentence, or --text-control zero for a policy that is told nothing"
+        raise ConfigError("--text is empty", cure)
+    if options.text is not None and changed:
+        raise ConfigError(f"--text with {changed[0]}", "give one of the two: each names the text")
+    if options.weights is not None and what_is(options.weights) != "directory":
+        cause = f"--weights {brief(options.weights)} is no directory"
+        raise ConfigError(cause, "give the one that holds the text encoder's model")
+    if options.physics == "metaworld" and options.z in DONATED:
+        cause = f"--z {options.z} with --physics metaworld, where lanes know nothing of each other"
+        raise ConfigError(cause, "use --z posterior, prior or text, or --physics native")
+
+
+def _check_values(options: EvalOptions) -> None:
+    """Ranges and names, which the command line's flags have looked at and a program has not."""
+    ranges = {
+        "k": (0, MOST_EPISODES),
+        "goals": (1, GOALS),
+        "draws": (1, MOST_DRAWS),
+        "seed": (0, LARGEST_SEED),
+        "horizon": (1, MOST_STEPS),
+        "lanes": (1, LARGEST),
+    }
+    for name, (low, high) in ranges.items():
+        value = getattr(options, name)
+        for number in value if name == "k" and value is not None else (value,):
+            if number is None and name in ("k", "horizon", "lanes"):
+                continue
+            if type(number) is not int or not low <= number <= high:
+                cause = f"{name} is {brief(repr(value))}"
+                raise ConfigError(cause, f"give whole numbers from {low} to {high}")
+    for name, hint in typing.get_type_hints(EvalOptions).items():
+        choices = [c for h in (hint, *typing.get_args(hint)) for c in _words(h)]
+        if choices and getattr(options, name) not in (None, *choices):
+            cause = f"{name} is {brief(repr(getattr(options, name)))}"
+            raise ConfigError(cause, f"valid: {', '.join(choices)}")
+
+
+def _words(hint: Any) -> tuple[str, ...]:
+    return typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
 
 
 def check_run(options: EvalOptions, run: Path) -> Config:

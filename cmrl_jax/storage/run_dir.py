@@ -140,6 +140,27 @@ def forget_unbegun(run: Path) -> None:
         (run / "config.yaml").unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def begun(run: Path, config_yaml: str, resume: bool) -> Iterator[None]:
+    """Holds a run directory whose `config.yaml` is written: from then on it can be resumed.
+
+    A new run that is refused (ValueError) before it wrote anything else is forgotten.
+
+    Raises:
+        ConfigError: another process writes to it, a write failed, or it holds a run already.
+    """
+    with writing_to(run):
+        if not resume:
+            check_unused(run)  # once more: another process may have come and gone
+        write_text(run / "config.yaml", config_yaml)
+        try:
+            yield
+        except ValueError:
+            if not resume:
+                forget_unbegun(run)
+            raise
+
+
 def cannot_write(run: Path, error: OSError) -> ConfigError:
     """What to tell a user whose run directory refuses a write."""
     cause = f"cannot write to run directory {run}: {error.strerror}"

@@ -1,4 +1,4 @@
-"""The host loop: iterations, console and CSV, periodic evaluation, checkpoints, signals.
+"""The host loop: iterations, their rows and loggers, periodic evaluation, checkpoints, stops.
 
 Everything numerical happens in two compiled programs (a training iteration, an evaluation episode);
 this file only decides when, and writes things down. NOTE: this is the one impure layer.
@@ -10,7 +10,7 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,25 +25,20 @@ from cmrl_jax.algorithms.cmrl.collect import (
     metric_names,
     metric_row,
 )
-from cmrl_jax.commands import command
 from cmrl_jax.config.rules import check_devices
 from cmrl_jax.config.schema import Config, ConfigError, lanes_per_task
 from cmrl_jax.evaluation.scores import fault_warning, format_scores, of_policy, summarise
 from cmrl_jax.evaluation.session import Session, policy_params, prepare_jax
 from cmrl_jax.formats import format_duration
-from cmrl_jax.stop import StopSignal
+from cmrl_jax.stop import Stop
 from cmrl_jax.storage.checkpoint import full_store, join_run, policy_store, split_run
 from cmrl_jax.storage.run_dir import write_text
 from cmrl_jax.storage.versions import package_versions, write_versions
-from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
 from cmrl_jax.text.goals import check_same_table
+from cmrl_jax.training.loggers import Logger, Progress, RunInfo
 from cmrl_jax.training.metrics import (
     LEADING_COLUMNS,
-    Console,
     MetricsCsv,
-    TensorBoard,
-    format_evaluation,
-    format_iteration,
 )
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
@@ -78,11 +73,36 @@ class Schedule:
         return iterations_done % self.eval_interval == 0
 
 
-def train(config: Config, run_dir: Path, stop: StopSignal, resume: bool = False) -> int:
-    """Trains to the end of the schedule or to a signal; returns the exit code.
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a call of `train` ended; everything is saved.
+
+    Attributes:
+        iteration: iterations done.
+        is_finished: whether the schedule was; else it was asked to stop.
+        evaluation: of the end, as `scores.summarise` has it; None where it was stopped before.
+        wall_s: seconds of training, those of resumed processes added up.
+    """
+
+    iteration: int
+    is_finished: bool
+    evaluation: dict[str, Any] | None
+    wall_s: float
+
+
+def train(
+    config: Config,
+    run_dir: Path,
+    loggers: Sequence[Logger] = (),
+    stop: Stop | None = None,
+    resume: bool = False,
+) -> Outcome:
+    """Trains to the end of the schedule, or to a stop.
 
     Args:
-        stop: the signal handlers, already installed.
+        run_dir: its `config.yaml` is written, and it is held (`run_dir.begun`).
+        loggers: are started and closed here.
+        stop: is looked at between iterations, and in the last evaluation.
 
     Raises:
         ConfigError: anything the user can mend, before the first compile where possible.
@@ -92,7 +112,8 @@ def train(config: Config, run_dir: Path, stop: StopSignal, resume: bool = False)
     check_devices(config, parallel.size(parallel.make_mesh()))
     session = Session(config)
     with full_store(run_dir, config.checkpoint.keep) as full, policy_store(run_dir) as policy:
-        return _Run(config, run_dir, session, full, policy, stop).go(device, resume)
+        run = _Run(config, run_dir, session, full, policy, loggers, stop or Stop())
+        return run.go(device, resume)
 
 
 class _Stopped(Exception):
@@ -109,16 +130,25 @@ class _Run:
         session: Session,
         full: Any,
         policy: Any,
-        stop: StopSignal,
+        loggers: Sequence[Logger],
+        stop: Stop,
     ):
-        self.config, self.run_dir, self.stop = config, run_dir, stop
+        self.config, self.run_dir, self.loggers, self.stop = config, run_dir, loggers, stop
         self.session, self.full, self.policy = session, full, policy
         self.schedule = Schedule.of(config)
-        # Who cannot be told what happens has left: the run saves and ends.
-        self.console = Console(config.log.progress, on_error=stop.request)
-        self.say = self.console.line
 
-    def go(self, device: str, resume: bool) -> int:
+    def say(self, text: str) -> None:
+        for logger in self.loggers:
+            logger.message(text)
+
+    def go(self, device: str, resume: bool) -> Outcome:
+        try:
+            return self.train(device, resume)
+        finally:
+            for logger in self.loggers:
+                logger.close()
+
+    def train(self, device: str, resume: bool) -> Outcome:
         self.say(f"device: {device}")
         mesh = parallel.make_mesh()
         iteration = make_train_iteration(
@@ -146,12 +176,10 @@ class _Run:
             while self.iterations_left() and not self.stop.requested:
                 self.step()
             self.save()
-            return self.leave() if self.stop.requested else self.finish()
+            evaluation = None if self.stop.requested else self.finish()
+            return Outcome(self.done, evaluation is not None, evaluation, self.wall)
         finally:
             self.csv.close()
-            self.console.close()
-            if self.tensorboard is not None:
-                self.tensorboard.close()
 
     def columns(self, metrics: dict[str, Any]) -> list[str]:
         config, tasks = self.config, self.session.eval_tasks
@@ -179,10 +207,9 @@ class _Run:
             self.done, self.wall = 0, 0.0
             self.csv = MetricsCsv(csv_path, columns)
         write_versions(self.run_dir / "versions.json")
-        self.tensorboard = None
-        if config.log.tensorboard:
+        for logger in self.loggers:
             begun = time.time() - self.wall
-            self.tensorboard = TensorBoard(self.run_dir / "tensorboard", self.csv.rows(), begun)
+            logger.start(RunInfo(self.run_dir, config.tasks.train, self.csv.rows(), begun))
         self.evaluator = self.session.evaluator()
         self.clock = time.monotonic() - self.wall
         self.save()
@@ -234,12 +261,8 @@ class _Run:
         self.wall = time.monotonic() - self.clock
         row["wall_s"] = self.wall
         self.csv.write(row)
-        if self.tensorboard is not None:
-            self.tensorboard.write(row)
-        self.say(format_iteration(row, config.tasks.train, self.seconds_left()))
-        if evaluation := format_evaluation(row):
-            self.say(evaluation)
-        self.console.advance(self.share_done())
+        for logger in self.loggers:
+            logger.row(row, Progress(self.share_done(), self.seconds_left()))
         if self.is_policy_due() or self.wall - self.saved_at >= 60 * config.checkpoint.minutes:
             self.save()
 
@@ -335,16 +358,17 @@ class _Run:
             }
             self.policy.save({"policy": policy}, meta)
 
-    def finish(self) -> int:
+    def finish(self) -> dict[str, Any] | None:
         """The final evaluation: more goals, every k, written beside the CSV.
 
-        Left at once where a stop is asked for: all is saved, and a resumed run evaluates anew.
+        Left at once, with None, where a stop is asked for: all is saved, and a resumed run
+        evaluates anew.
         """
         evaluation = self.config.eval
         try:
             summary = self.scores(evaluation.final_goals, evaluation.final_k, self.check_stop)
         except _Stopped:
-            return self.leave()
+            return None
         result = {
             "tasks": summary,
             "goals": evaluation.final_goals,
@@ -356,21 +380,8 @@ class _Run:
         write_text(self.run_dir / "eval.json", json.dumps(result, indent=2) + "\n")
         self.say(format_scores(summary))
         self.say(f"done in {format_duration(self.wall)}: {self.run_dir}")
-        return 0
+        return summary
 
     def check_stop(self) -> None:
         if self.stop.requested:
             raise _Stopped
-
-    def leave(self) -> int:
-        """Says how a saved run goes on; returns the exit code."""
-        text = f"stopped after iteration {self.done}; go on with: {self.resume_command()}"
-        self.say(text)
-        if self.console.error is None:
-            return 0
-        to_stderr(text)
-        is_left = self.console.error.errno in READER_LEFT
-        return 0 if is_left else exit_code(self.console.error)
-
-    def resume_command(self) -> str:
-        return command("--run", self.run_dir, "--resume")

@@ -1,0 +1,197 @@
+"""The library: what `import cmrl_jax` offers, in terms of the same parts as the command line.
+
+Nothing here prints, installs a signal handler or ends the process, and everything may be called
+from any thread, again and again.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from cmrl_jax.config.files import check_resumable, load_config, read_yaml, to_yaml
+from cmrl_jax.config.rules import validate
+from cmrl_jax.config.schema import Config, ConfigError, call_envs
+from cmrl_jax.evaluation.options import EvalOptions, check_options, check_run
+from cmrl_jax.evaluation.results import Evaluation, score
+from cmrl_jax.evaluation.session import Policy, Session, load_policy, prepare_jax
+from cmrl_jax.evaluation.trials import evaluation_config
+from cmrl_jax.stop import Stop
+from cmrl_jax.storage.run_dir import begun, find_run, new_run
+from cmrl_jax.training import trainer
+from cmrl_jax.training.loggers import Console, Logger, TensorBoard
+from envs.sawyer import Ml4Env
+
+__all__ = [
+    "Agent",
+    "Config",
+    "ConfigError",
+    "Evaluation",
+    "Logger",
+    "Stop",
+    "TrainResult",
+    "evaluate",
+    "load_agent",
+    "load_config",
+    "make_env",
+    "train",
+]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained policy, ready to be evaluated.
+
+    Attributes:
+        run: its run directory.
+        policy: parameters, text vectors of its tasks, and the checkpoint's record.
+    """
+
+    run: Path
+    policy: Policy = field(repr=False)
+
+    @property
+    def iteration(self) -> int:
+        """Iterations that it was trained for."""
+        return self.policy.meta["iteration"]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """How training ended.
+
+    Attributes:
+        run_dir: the run's directory, with all that `--resume`, `eval` and `plot` read.
+        iteration: iterations done.
+        is_finished: whether the schedule was; else it was asked to stop and can be resumed.
+        evaluation: {task: {k: figures}} of the last evaluation; None where it was stopped.
+    """
+
+    run_dir: Path
+    iteration: int
+    is_finished: bool
+    evaluation: dict[str, Any] | None
+
+    @functools.cached_property
+    def agent(self) -> Agent:
+        """The policy as it was saved last.
+
+        Raises:
+            ConfigError: it was stopped before its first iteration.
+        """
+        return load_agent(self.run_dir)
+
+    @property
+    def metrics(self) -> list[dict[str, float | None]]:
+        """The rows of metrics.csv, oldest first; None where a figure was not taken."""
+        with open(self.run_dir / "metrics.csv", encoding="utf-8", newline="") as file:
+            return [
+                {name: float(text) if text else None for name, text in row.items()}
+                for row in csv.DictReader(file)
+            ]
+
+
+def train(
+    config: Config,
+    run_dir: str | Path | None = None,
+    *,
+    resume: bool = False,
+    loggers: Sequence[Logger] | None = None,
+    stop: Stop | None = None,
+) -> TrainResult:
+    """Trains to the end of the configuration's schedule.
+
+    Args:
+        config: from `load_config`, or built by hand.
+        run_dir: a directory without a run; by default a new one in `runs/`. With `resume`, the
+            one to go on with, bit for bit as if it had not been left.
+        loggers: take rows and messages; by default lines on standard output, and TensorBoard
+            where `log.tensorboard` asks for it. An empty list is silent.
+        stop: `stop.request()`, from any thread, ends the run at the next border of an iteration.
+
+    Raises:
+        ConfigError: what the caller can mend: a rule that the configuration breaks, a directory
+            that holds another run, a damaged checkpoint.
+    """
+    validate(config)
+    if resume:
+        if run_dir is None:
+            raise ConfigError("resume without a run directory", "name it: run_dir=")
+        run = find_run(Path(run_dir))
+        if (run / "config.yaml").is_file():
+            check_resumable(read_yaml(run / "config.yaml")[0], config, run)
+    else:
+        run = new_run(config.name, None if run_dir is None else Path(run_dir))
+    if loggers is None:
+        loggers = [Console(progress=False), *([TensorBoard()] if config.log.tensorboard else [])]
+    with begun(run, to_yaml(config), resume):
+        outcome = trainer.train(config, run, loggers, stop, resume)
+    return TrainResult(run, outcome.iteration, outcome.is_finished, outcome.evaluation)
+
+
+def load_agent(run_dir: str | Path, checkpoint: int | None = None) -> Agent:
+    """The policy of a run.
+
+    Args:
+        checkpoint: iteration of the policy checkpoint; None for the newest.
+
+    Raises:
+        ConfigError: no run or no such checkpoint there, or it does not fit this program.
+    """
+    run = find_run(Path(run_dir))
+    config = evaluation_config(run, "native")  # reading a policy needs no simulator of its own
+    prepare_jax(config)
+    return Agent(run, load_policy(run, Session(config), checkpoint))
+
+
+def evaluate(
+    agent: Agent,
+    tasks: Sequence[str] | None = None,
+    k: Sequence[int] | None = None,
+    **options: Any,
+) -> Evaluation:
+    """Scores an agent by the meta-test protocol: `k` episodes of own experience, then one counted.
+
+    Args:
+        tasks: names; by default those of the run.
+        k: numbers of adaptation episodes; by default `eval.final_k` of the run.
+        options: other fields of `EvalOptions`: `goals`, `goal_set`, `draws`, `seed`, `physics` ...
+
+    Raises:
+        ConfigError: an option out of range, or one that does not apply to the agent.
+    """
+    known = EvalOptions.__dataclass_fields__
+    for name in options:
+        if name not in known:
+            raise ConfigError(f"unknown option '{name}'", f"valid: {', '.join(known)}")
+    chosen = EvalOptions(
+        tasks=None if tasks is None else tuple(tasks), k=None if k is None else tuple(k), **options
+    )
+    if chosen.physics == "metaworld":
+        cure = "use mjx or native, or: cmrl eval --physics metaworld"
+        raise ConfigError("physics 'metaworld' is the command line's alone", cure)
+    check_options(chosen)
+    check_run(chosen, agent.run)
+    config = evaluation_config(agent.run, chosen.physics)
+    prepare_jax(config)
+    return score(agent.run, Session(config), agent.policy, chosen)
+
+
+def make_env(config: Config | None = None, **overrides: Any) -> Ml4Env:
+    """The environment of a configuration: pure `reset` and `step` of one lane, for vmap and scan.
+
+    Args:
+        config: whose `env` section to build; the defaults' if None.
+        overrides: fields of that section, as `physics="native"`.
+
+    Raises:
+        ConfigError: a value that the section cannot have.
+    """
+    config = config or Config()
+    env = replace(config.env, **overrides)
+    validate(replace(config, env=env))
+    return call_envs(lambda: Ml4Env(env.goal_observable, env.physics, env.obs_mode))

@@ -1,0 +1,125 @@
+"""`train.py [train] --config ml4.yaml`: flags of the whole schema, the run directory, signals."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import typing
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from cmrl_jax.cli.flags import COMMANDS, Parser, parse
+from cmrl_jax.cli.stop_signal import StopSignal
+from cmrl_jax.commands import command, program, shown
+from cmrl_jax.config.files import (
+    check_resumable,
+    config_dirs,
+    field_types,
+    find_config,
+    read_yaml,
+    resolve,
+    to_yaml,
+)
+from cmrl_jax.config.schema import Config, ConfigError, leaves
+from cmrl_jax.stop import Stop
+from cmrl_jax.storage.run_dir import begun, config_stem, find_run, new_run, resumed_run
+from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
+from cmrl_jax.text.goal_files import find_table
+from envs.command_line import typed_path
+
+
+def train_parser() -> argparse.ArgumentParser:
+    """Flags of `train`: one for each leaf of the config schema, with its text and default."""
+    flags = Parser(
+        prog=program(),
+        usage="%(prog)s --config X.yaml [--section.key VALUE ...] [--run DIR] [--resume]",
+        description="Meta-trains on the tasks of a YAML config, in one process, on any device.",
+        epilog=f"commands: {', '.join(COMMANDS)}; each has its own --help",
+        allow_abbrev=False,
+    )
+    flags.add_argument(
+        "--config", metavar="X.yaml", type=typed_path, help="a file, or a name in configs/"
+    )
+    flags.add_argument("--run", metavar="DIR", type=typed_path, help="run directory [runs/X-TIME]")
+    flags.add_argument(
+        "--resume", action="store_true", help="go on with --run DIR, or with the newest run of X"
+    )
+    groups = {"": flags.add_argument_group("config: defaults < YAML < these flags")}
+    for name, f, default in leaves(Config()):
+        section = name.rpartition(".")[0]
+        if section not in groups:
+            groups[section] = flags.add_argument_group(section)
+        text = f"{f.metadata['doc']} [{shown(default)}]".replace("%", "%%")
+        groups[section].add_argument(
+            f"--{name}", metavar=_metavar(default, f, name), default=argparse.SUPPRESS, help=text
+        )
+    return flags
+
+
+def _metavar(default: Any, f: Any, name: str) -> str:
+    owner: Any = Config
+    for section in name.split(".")[:-1]:
+        owner = field_types(owner)[section]
+    hint = field_types(owner)[f.name]
+    if typing.get_origin(hint) is Literal:
+        return "|".join(typing.get_args(hint))
+    if typing.get_origin(hint) is tuple:
+        return "A,B,.."
+    return {bool: "true|false", int: "N", float: "X", str: "TEXT"}[type(default)]
+
+
+def run_train(words: Sequence[str]) -> int:
+    """The command `train`; returns the exit code."""
+    args = vars(parse(train_parser(), words))
+    name, run, resume = args.pop("config"), args.pop("run"), args.pop("resume")
+    if name is None and run is not None and resume:
+        name = find_run(run) / "config.yaml"
+    if name is None:
+        found = sorted({p.name for d in config_dirs()[1:] for p in d.glob("*.yaml")})
+        raise ConfigError("no --config given", f"add --config with one of: {', '.join(found)}")
+    path = find_config(name)
+    config = resolve(*read_yaml(path), flags=args)
+    _check_extras(config)
+    if resume:
+        run = resumed_run(config_stem(path), run)
+        if (run / "config.yaml").is_file():
+            check_resumable(read_yaml(run / "config.yaml")[0], config, run)
+    else:
+        run = new_run(config_stem(path), run)
+    with begun(run, to_yaml(config), resume):
+        stop = StopSignal()  # before the imports that take seconds
+        try:
+            return _in_console(config, run, stop, resume)
+        finally:
+            stop.restore()
+
+
+def _in_console(config: Config, run: Path, stop: Stop, resume: bool) -> int:
+    """Trains, and says how it ended; returns the exit code."""
+    from cmrl_jax.formats import format_duration
+    from cmrl_jax.training import trainer
+    from cmrl_jax.training.loggers import Console, TensorBoard
+
+    # Who cannot be told what happens has left: the run saves and ends.
+    console = Console(config.log.progress, on_error=stop.request)
+    loggers = [console, *([TensorBoard()] if config.log.tensorboard else [])]
+    outcome = trainer.train(config=config, run_dir=run, loggers=loggers, stop=stop, resume=resume)
+    if outcome.is_finished:
+        console.message(f"done in {format_duration(outcome.wall_s)}: {run}")
+        return 0
+    text = f"stopped after iteration {outcome.iteration}; "
+    text += f"go on with: {command('--run', run, '--resume')}"
+    console.message(text)
+    if console.error is None:
+        return 0
+    to_stderr(text)
+    is_left = console.error.errno in READER_LEFT
+    return 0 if is_left else exit_code(console.error)
+
+
+def _check_extras(config: Config) -> None:
+    find_table(config.goals.table)
+    if config.log.tensorboard and importlib.util.find_spec("tensorboardX") is None:
+        cause = "log.tensorboard needs the package tensorboardX, which is not installed"
+        raise ConfigError(cause, "pip install 'cmrl-jax[viz]', or set log.tensorboard: false")
