@@ -1,7 +1,6 @@
 """Means, intervals and the CSV of cells, without any physics."""
 
 import csv
-import math
 
 import numpy as np
 import pytest
@@ -9,13 +8,13 @@ import pytest
 from cmrl_jax.evaluation.cells import COLUMNS, FIGURES, CellTable
 from cmrl_jax.evaluation.episode import Episode
 from cmrl_jax.evaluation.scores import (
-    bootstrap_interval,
     cell_rows,
     format_scores,
     of_policy,
     summarise,
     summarise_rows,
 )
+from cmrl_jax.evaluation.statistics import wilson_interval
 
 TASKS = ("window-open", "window-close")
 COMMON = {
@@ -68,15 +67,16 @@ def test_means_over_goals_and_draws():
     assert low < figures["success_any"] < high
 
 
-def test_the_interval_is_the_binomials():
-    """50 goals with 40 successes: the sampling distribution of the mean is known exactly."""
-    values = np.r_[np.ones(40), np.zeros(10)]
-    cdf = np.cumsum([math.comb(50, n) * 0.8**n * 0.2 ** (50 - n) for n in range(51)])
-    exact = [np.searchsorted(cdf, q) / 50 for q in (0.025, 0.975)]
-    np.testing.assert_allclose(bootstrap_interval(values), exact, atol=0.021)
-    assert bootstrap_interval(values) == bootstrap_interval(values)  # no draw of the clock's
-    assert bootstrap_interval(np.ones(50)) == [1.0, 1.0]
-    assert bootstrap_interval(np.ones(1)) == [1.0, 1.0]
+def test_a_rate_has_wilsons_interval_and_a_return_its_own():
+    own, figures = SCORES[2], summarise(of_policy(SCORES, 1), TASKS)["window-close"]["2"]
+    goals = own.success_any.shape[2]
+    expected = wilson_interval(own.success_any[1, 1].mean(), goals)
+    assert figures["interval_95"]["success_any"] == pytest.approx(list(expected))
+    low, high = figures["interval_95"]["return"]
+    assert low < figures["return"] < high
+    sure = {0: Episode(*(np.ones((1, 50, 1)) for _ in Episode._fields))}
+    low, high = summarise(sure, ("a",))["a"]["0"]["interval_95"]["success_any"]
+    assert (round(low, 2), high) == (0.93, 1.0)
 
 
 def test_draws_of_a_goal_do_not_count_as_goals():

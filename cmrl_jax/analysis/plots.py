@@ -3,8 +3,8 @@
 From metrics.csv: success and return over env steps. From eval.json: the paper's bars and success
 by adaptation episodes. From inspection.json, which `--inspect` takes from the last policy
 checkpoint (inspection.py): routing and latents.
-Runs that are seeds of one (run_groups.py) are one group: its mean, and a band from the lowest to
-the highest.
+Runs that are seeds of one (run_groups.py) are one group: the interquartile mean of its seeds, and a
+band of its 95 % bootstrap interval over them (evaluation/statistics.py).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from cmrl_jax.analysis.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.analysis.inspection_file import read_inspection
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import Config, ConfigError, as_config_error
+from cmrl_jax.evaluation.statistics import interquartile_mean, seeds_band
 from cmrl_jax.storage.output_files import writable
 from cmrl_jax.storage.run_files import (
     EVALUATION,
@@ -42,7 +43,7 @@ def series(rows: Sequence[Row], column: str) -> Series:
 
 
 def band(curves: Sequence[Series]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Env steps, and mean, lowest and highest of curves where all have a figure, (point,) each.
+    """Env steps where all curves have a figure; IQM and 95 % interval over them, (point,) each.
 
     A curve has one between its first point and its last, read linearly between two. The points are
     those of all curves; none where curves do not overlap.
@@ -52,7 +53,7 @@ def band(curves: Sequence[Series]) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     steps = np.unique(np.concatenate([p[:, 0] for p in points]))
     steps = steps[(first <= steps) & (steps <= last)]
     values = np.array([np.interp(steps, *p.T) for p in points])
-    return steps, values.mean(0), values.min(0), values.max(0)
+    return steps, *seeds_band(values)
 
 
 def final_evaluation(run: Path, rows: Sequence[Row]) -> Evaluation | None:
@@ -180,14 +181,14 @@ def _finish(
 def _draw_band(axis: Any, curves: Sequence[Series], color: str, style: str, label: str) -> None:
     if not curves:
         return
-    steps, mean, low, high = band(curves)
+    steps, middle, low, high = band(curves)
     if not len(steps):  # at no step do all have a figure: no mean, each by itself
         for curve in curves:
             _draw_band(axis, [curve], color, style, label)
         return
     one = len(steps) == 1  # a line or an area of one point is not seen
     marker = "o" if one else None
-    axis.plot(steps, mean, color=color, ls=style, lw=1.2, marker=marker, ms=4, label=label)
+    axis.plot(steps, middle, color=color, ls=style, lw=1.2, marker=marker, ms=4, label=label)
     if len(curves) > 1:
         axis.fill_between(steps, low, high, color=color, alpha=0.2, lw=3 if one else 0)
 
@@ -246,8 +247,8 @@ def plot_bars(runs: Runs, out: Path) -> Path:
             label = f"{group}, k = {k} (filled: last step){runs.mark(group, task)}"
             hatch = "////" if runs.holds_out(group, task) else None
             outline: dict[str, Any] = {"ec": f"C{index}", "fc": "none", "hatch": hatch}
-            axis.bar(x, np.mean(figures[0]), 0.9 * width, label=label, **outline)
-            axis.bar(x, np.mean(figures[1]), 0.9 * width, color=f"C{index}", alpha=0.45)
+            axis.bar(x, interquartile_mean(figures[0]), 0.9 * width, label=label, **outline)
+            axis.bar(x, interquartile_mean(figures[1]), 0.9 * width, color=f"C{index}", alpha=0.45)
             axis.plot([x] * len(results), figures[0], ".", color="k", ms=4)  # the seeds
     axis.set_xticks(
         range(len(runs.tasks)),

@@ -14,16 +14,8 @@ import numpy as np
 
 from cmrl_jax.evaluation.cells import FIGURES, Row, as_text
 from cmrl_jax.evaluation.episode import Episode
+from cmrl_jax.evaluation.statistics import mean_interval, wilson_interval
 from cmrl_jax.formats import format_figure
-
-RESAMPLES = 2000
-
-
-def bootstrap_interval(values: np.ndarray) -> list[float]:
-    """95 % percentile bootstrap interval of the mean over goals; values (goal,)."""
-    generator = np.random.default_rng(0)
-    index = generator.integers(0, len(values), (RESAMPLES, len(values)))
-    return [float(x) for x in np.quantile(values[index].mean(1), (0.025, 0.975))]
 
 
 def of_policy(scores: Mapping[int, Episode], policy: int) -> dict[int, Episode]:
@@ -54,10 +46,9 @@ def _summary(figures: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Figures of one task and k, each (goal,)."""
     named = {{"first_success": "first_success_step"}.get(n, n): v for n, v in figures.items()}
     means: dict[str, Any] = {name: float(values.mean()) for name, values in named.items()}
-    with_interval = ("success_any", "success_last", "return")
-    return means | {
-        "interval_95": {name: bootstrap_interval(named[name]) for name in with_interval}
-    }
+    rates, goals = ("success_any", "success_last"), len(named["return"])
+    intervals = {name: list(wilson_interval(means[name], goals)) for name in rates}
+    return means | {"interval_95": intervals | {"return": list(mean_interval(named["return"]))}}
 
 
 def format_scores(summary: Mapping[str, Any]) -> str:
