@@ -85,9 +85,19 @@ def gl():
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
-    """A finished native run of smoke.yaml, for whole runs to be compared with; do not change it."""
+    """A finished `native` run of smoke.yaml, for others to be compared with; do not change it."""
     from run_helpers import native, smoke
 
     run = tmp_path_factory.mktemp("undisturbed") / "run"
     assert smoke(run, *native()) == 0
+    return run
+
+
+@pytest.fixture(scope="session")
+def undisturbed_modular(tmp_path_factory):
+    """The same with the soft modules of smoke.yaml."""
+    from run_helpers import modular, smoke
+
+    run = tmp_path_factory.mktemp("modular") / "run"
+    assert smoke(run, *modular()) == 0
     return run

@@ -23,9 +23,14 @@ TRAIN = (sys.executable, str(ROOT / "train.py"))
 ITERATIONS = 4  # of the undisturbed native run
 
 
-def native(iterations=ITERATIONS):
-    """Flags of a smoke run of seconds: MuJoCo C compiles nothing."""
+def modular(iterations=ITERATIONS):
+    """Flags of a smoke run on MuJoCo C, which compiles nothing."""
     return "--env.physics", "native", "--train.env_steps", str(600 * iterations)
+
+
+def native(iterations=ITERATIONS):
+    """The same without modules, half of it to compile: for tests that ask nothing of networks."""
+    return *modular(iterations), "--model.net", "mlp"
 
 
 def smoke_words(run, *words):

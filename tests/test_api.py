@@ -10,6 +10,12 @@ from run_helpers import ITERATIONS
 
 import cmrl_jax as cj
 
+OVERRIDES = {
+    "train.env_steps": 600 * ITERATIONS,
+    "env.physics": "native",
+    "model.net": "mlp",
+}  # the flags of `run_helpers.native`
+
 
 def in_thread(function):
     """Calls a function off the main thread; returns what it returns, raises what it raises."""
@@ -45,8 +51,7 @@ def results(tmp_path_factory, handler):
     """The snippet of the README, twice, in a thread that is not the main one."""
 
     def snippet(run_dir):
-        overrides = {"train.env_steps": 600 * ITERATIONS, "env.physics": "native"}
-        config = cj.load_config("smoke", overrides, seed=0)
+        config = cj.load_config("smoke", OVERRIDES, seed=0)
         result = cj.train(config, run_dir=run_dir)
         return result, cj.evaluate(result.agent, tasks=["window-close"], k=(0, 1), goals=2)
 
@@ -90,7 +95,7 @@ def test_a_stop_from_another_thread_ends_a_run_that_goes_on(tmp_path, results, c
             stop.request()
 
     stop = cj.Stop()
-    config = cj.load_config("smoke", {"train.env_steps": 600 * ITERATIONS, "env.physics": "native"})
+    config = cj.load_config("smoke", OVERRIDES)
     stopped = cj.train(config, tmp_path / "run", loggers=[Once()], stop=stop)
     assert (stopped.iteration, stopped.is_finished, stopped.evaluation) == (1, False, None)
     assert stopped.agent.iteration == 1

@@ -134,7 +134,7 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         critic_params=spread(made.state.critic_params),
         log_alpha=jnp.array([-1.0, -2.0, -6.0]),
     )
-    fresh = learner.init(jax.random.key(5))
+    fresh = jax.jit(learner.init)(jax.random.key(5))
     state = start_state("all", config, learner, fresh, trained, GOALS[0, 0])
     assert not changed(trained, state)
     np.testing.assert_allclose(state.log_alpha, [-3.0])  # the mean of the training tasks'
@@ -153,8 +153,8 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         (["--task", "window-close", "--adapt", "z,all,z"], "--adapt names z twice", "once"),
     ],
 )
-def test_mistakes_are_refused(undisturbed, refused, words, cause, cure):
-    got = refused("finetune", "--run", str(undisturbed), *words)
+def test_mistakes_are_refused(undisturbed_modular, refused, words, cause, cure):
+    got = refused("finetune", "--run", str(undisturbed_modular), *words)
     assert cause in got[0] and cure in got[1]
 
 
@@ -220,34 +220,34 @@ def test_what_a_run_could_be_trained_with_can_be_adapted(adapt):
     ],
 )
 def test_a_figure_that_cannot_be_drawn_is_refused_first(
-    undisturbed, refused, tmp_path, monkeypatch, figure, cause, cure
+    undisturbed_modular, refused, tmp_path, monkeypatch, figure, cause, cure
 ):
     if "matplotlib" in cause:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setitem(sys.modules, "matplotlib.backend_bases", None)
     monkeypatch.setattr(finetune_cli, "finetune_run", lambda *_: pytest.fail("it went on"))
     words = ["--task", "window-close", "--figure", str(tmp_path / figure)]
-    got = refused("finetune", "--run", str(undisturbed), *words)
+    got = refused("finetune", "--run", str(undisturbed_modular), *words)
     assert cause in got[0] and cure in got[1]
     assert not any(tmp_path.glob("f.*"))
 
 
-def test_another_goal_table_is_refused(undisturbed, monkeypatch):
+def test_another_goal_table_is_refused(undisturbed_modular, monkeypatch):
     """Before any way to adapt is built."""
     changed = lambda *words: replace(load_goals(*words), sha256="0" * 64)
     monkeypatch.setattr(finetune_cli, "load_goals", changed)
     monkeypatch.setattr(finetune_cli, "FineTuning", lambda *_: pytest.fail("it went on"))
     options = FinetuneOptions("window-close", adapt=("posterior",))
     with pytest.raises(ConfigError, match="another goal table .*\nput that table back"):
-        finetune_cli.finetune_run(undisturbed, options, None, None)
+        finetune_cli.finetune_run(undisturbed_modular, options, None, None)
 
 
-def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
+def test_a_short_run_writes_its_curves(undisturbed_modular, tmp_path, capsys):
     """Before any experience every way to adapt scores the trained policy; scratch does not."""
     out = tmp_path / "curves.json"
     words = ["--task", "window-close", "--episodes", "2", "--goals", "2", "--json", str(out)]
     ways = ["--adapt", "posterior,router"]
-    assert main(["finetune", "--run", str(undisturbed), *words, *ways]) == 0
+    assert main(["finetune", "--run", str(undisturbed_modular), *words, *ways]) == 0
     result = json.loads(out.read_text())
     curves = result["curves"]
     assert set(curves) == {"posterior", "router"} and list(curves["router"]) == ["0", "1", "2"]
@@ -258,7 +258,7 @@ def test_a_short_run_writes_its_curves(undisturbed, tmp_path, capsys):
     assert "router" in out and "warning" not in out
 
 
-def test_physics_faults_are_counted_and_told(undisturbed, tmp_path, capsys, monkeypatch):
+def test_physics_faults_are_counted_and_told(undisturbed_modular, tmp_path, capsys, monkeypatch):
     """Of read-outs as a mean over lanes, of own episodes as a sum so far."""
     calls = iter(range(10**9))
     original = NativePhysics._simulate
@@ -273,7 +273,9 @@ def test_physics_faults_are_counted_and_told(undisturbed, tmp_path, capsys, monk
     monkeypatch.setattr(NativePhysics, "_simulate", simulate)
     out = tmp_path / "curves.json"
     words = ["--episodes", "1", "--goals", "2", "--adapt", "posterior", "--json", str(out)]
-    assert main(["finetune", "--run", str(undisturbed), "--task", "window-close", *words]) == 0
+    assert (
+        main(["finetune", "--run", str(undisturbed_modular), "--task", "window-close", *words]) == 0
+    )
     curve = json.loads(out.read_text())["curves"]["posterior"]
     assert [(curve[n]["faults"], curve[n]["own_faults"]) for n in "01"] == [(3.0, 0), (0.0, 1)]
     assert (
@@ -292,11 +294,11 @@ def test_dropped_gradient_steps_are_told():
 
 
 @pytest.fixture(scope="module")
-def restored(undisturbed):
+def restored(undisturbed_modular):
     """The run's configuration, its learner's state, a text vector and two placements."""
-    config = load_config(str(undisturbed / "config.yaml"))
+    config = load_config(str(undisturbed_modular / "config.yaml"))
     session = Session(config)
-    trained, _ = finetune_cli.load_learner(undisturbed, config, session)
+    trained, _ = finetune_cli.load_learner(undisturbed_modular, config, session)
     text = load_goals(config.goals.table, ("window-close",)).vectors[0, 0]
     placements = session.placements("heldout", 2, ("window-close",))[0]
     return config, trained, text, np.asarray(placements, np.float32)

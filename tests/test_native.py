@@ -216,9 +216,10 @@ def test_two_training_iterations_are_finite_and_repeat():
         config, session.env, session.learner, session.train_goals, session.train_placements()
     )
     program = jax.jit(iteration)
+    init = jax.jit(lambda key: init_run(config, session.learner, key))
     runs = []
     for _ in range(2):
-        state, _ = program(init_run(config, session.learner, jax.random.key(config.seed)))
+        state, _ = program(init(jax.random.key(config.seed)))
         runs.append(program(state))
     assert_same(runs[0][1], runs[1][1])
     assert_same(runs[0][0].learner.actor_params, runs[1][0].learner.actor_params)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_helpers import ITERATIONS, ROOT, checkpoint_leaves, native, rows_of, smoke, start
+from run_helpers import ITERATIONS, ROOT, checkpoint_leaves, modular, rows_of, smoke, start
 
 from cmrl_jax import parallel
 from cmrl_jax.config.files import load_config
@@ -59,20 +59,20 @@ def assert_close_training(run, other):
             assert distance <= 0.1 * np.linalg.norm(leaf) + 1e-3, path
 
 
-def test_a_run_begun_on_four_devices_goes_on_with_one(undisturbed, tmp_path):
+def test_a_run_begun_on_four_devices_goes_on_with_one(undisturbed_modular, tmp_path):
     run = tmp_path / "run"
-    on_four_devices(run, *native(ITERATIONS - 1))
+    on_four_devices(run, *modular(ITERATIONS - 1))
     assert json.loads((run / "versions.json").read_text())["device_count"] == DEVICES
-    assert smoke(run, *native(), "--resume") == 0
-    assert_close_training(run, undisturbed)
+    assert smoke(run, *modular(), "--resume") == 0
+    assert_close_training(run, undisturbed_modular)
 
 
-def test_a_run_begun_on_one_device_goes_on_with_four(undisturbed, tmp_path):
+def test_a_run_begun_on_one_device_goes_on_with_four(undisturbed_modular, tmp_path):
     run = tmp_path / "run"
-    shutil.copytree(undisturbed, run)
+    shutil.copytree(undisturbed_modular, run)
     shutil.rmtree(run / "ckpt" / str(ITERATIONS))
-    on_four_devices(run, *native(), "--resume")
-    assert_close_training(run, undisturbed)
+    on_four_devices(run, *modular(), "--resume")
+    assert_close_training(run, undisturbed_modular)
 
 
 def test_lanes_rings_and_batches_lie_in_four_parts():
@@ -125,7 +125,7 @@ def test_the_context_of_prior_lanes_alone_is_divided_too():
 
 
 def test_too_many_devices_are_two_lines_before_any_compile(tmp_path):
-    with start(tmp_path / "run", *native(), JAX_NUM_CPU_DEVICES="5") as process:
+    with start(tmp_path / "run", *modular(), JAX_NUM_CPU_DEVICES="5") as process:
         out = process.communicate()[0]
     assert process.returncode == 2
     cause, cure = out.splitlines()[-2:]

@@ -1,7 +1,7 @@
 """The loop end to end at smoke size, through the command line, on real physics.
 
-One run of `smoke.yaml` (module fixture) is compared with its repetition, its resumption and a run
-stopped by a signal; the presets run two iterations each.
+One run of `smoke.yaml` (module fixture) trains on mjx and is compared with its resumption. What
+does not ask for mjx runs on MuJoCo C, which has nothing to compile; the presets run two iterations.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from run_helpers import ROOT, assert_same_result, rows_of, run_and_signal, smoke
+from run_helpers import ROOT, assert_same_result, native, rows_of, run_and_signal, smoke
 
 from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
 from cmrl_jax.cli.main import main
@@ -75,11 +75,11 @@ def test_episodes_come_from_the_groups_that_the_config_asks_for(finished):
     assert counts[1] == counts[2] == [f"{3 * prior}.0", f"{3 * text}.0", f"{3 * posterior}.0"]
 
 
-def test_the_same_seed_gives_the_same_csv_and_another_seed_does_not(finished, tmp_path):
-    assert smoke(tmp_path / "same") == 0
-    assert rows_of(tmp_path / "same") == rows_of(finished[0])
-    assert smoke(tmp_path / "other", "--seed", "1", "--train.env_steps", "600") == 0
-    first, other = rows_of(finished[0])[0], rows_of(tmp_path / "other")[0]
+def test_the_same_seed_gives_the_same_csv_and_another_seed_does_not(undisturbed, tmp_path):
+    assert smoke(tmp_path / "same", *native()) == 0
+    assert rows_of(tmp_path / "same") == rows_of(undisturbed)
+    assert smoke(tmp_path / "other", *native(1), "--seed", "1") == 0
+    first, other = rows_of(undisturbed)[0], rows_of(tmp_path / "other")[0]
     assert first["train/drawer-open/return"] != other["train/drawer-open/return"]
 
 
@@ -91,37 +91,39 @@ def test_resume_equals_an_undisturbed_run_bit_for_bit(finished, tmp_path):
     assert_same_result(run, finished[0])
 
 
-def test_a_run_killed_before_its_first_save_resumes_from_the_start(finished, tmp_path):
+def test_a_run_killed_before_its_first_save_resumes_from_the_start(undisturbed, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
-    shutil.copy(finished[0] / "config.yaml", run)
+    shutil.copy(undisturbed / "config.yaml", run)
     assert main(["--run", str(run), "--resume", "--train.env_steps", "600"]) == 0
-    assert rows_of(run)[0] == rows_of(finished[0])[0]
+    assert rows_of(run)[0] == rows_of(undisturbed)[0]
 
 
-def test_resume_refuses_a_changed_field_by_name(finished, refused):
-    cause, cure = refused("--run", str(finished[0]), "--resume", "--sac.gamma", "0.9")
+def test_resume_refuses_a_changed_field_by_name(undisturbed, refused):
+    cause, cure = refused("--run", str(undisturbed), "--resume", "--sac.gamma", "0.9")
     assert "sac.gamma" in cause and cure
 
 
-def test_resume_refuses_another_goal_table(finished, tmp_path, monkeypatch, capsys):
+def test_resume_refuses_another_goal_table(undisturbed, tmp_path, monkeypatch, capsys):
     """The table of that name was made anew: same sentences, another release of the encoder."""
     with np.load(goal_files.table_path("minilm-l6-v2")) as data:
         np.savez(tmp_path / "goals-minilm-l6-v2.npz", **{**data, "revision": np.array("other")})
     monkeypatch.setattr(goal_files, "DATA", tmp_path)
-    before = rows_of(finished[0])
-    assert main(["--run", str(finished[0]), "--resume", "--train.env_steps", "9000"]) == 2
+    before = rows_of(undisturbed)
+    assert main(["--run", str(undisturbed), "--resume", "--train.env_steps", "9000"]) == 2
     assert "was trained with another goal table" in capsys.readouterr().err
-    assert rows_of(finished[0]) == before
+    assert rows_of(undisturbed) == before
 
 
-def test_sigterm_saves_and_leaves_with_code_0_and_the_resume_command(finished, tmp_path):
+def test_sigterm_saves_and_leaves_with_code_0_and_the_resume_command(undisturbed, tmp_path):
     run = tmp_path / "run"
-    code, lines = run_and_signal(run, "iter    1", "--train.env_steps", "60000")
+    code, lines = run_and_signal(run, "iter    1", *native(100))
     assert code == 0, lines
     assert f"train.py --run {run} --resume" in lines[-1], lines
-    rows, undisturbed = rows_of(run), rows_of(finished[0])
-    for row, other in zip(rows[:2], undisturbed, strict=False):  # a longer run evaluates later
+    rows = rows_of(run)
+    for row, other in zip(
+        rows[:2], rows_of(undisturbed), strict=False
+    ):  # a longer run evaluates later
         assert {c: row[c] for c in row if "eval/" not in c} == {
             c: other[c] for c in other if "eval/" not in c
         }
@@ -133,7 +135,7 @@ def test_sigterm_during_the_compile_stops_before_the_first_iteration(tmp_path):
     """A signal before the loop leaves the untrained state and a command that goes on with it."""
     run = tmp_path / "run"
     marker = "compiling the training iteration ..."
-    code, lines = run_and_signal(run, marker, JAX_ENABLE_COMPILATION_CACHE="false")
+    code, lines = run_and_signal(run, marker, *native(), JAX_ENABLE_COMPILATION_CACHE="false")
     assert code == 0, lines
     assert re.search(r"stopped after iteration 0; .*--resume", lines[-1]), lines
     assert rows_of(run) == []
@@ -141,15 +143,15 @@ def test_sigterm_during_the_compile_stops_before_the_first_iteration(tmp_path):
         assert store.steps() == [0]
 
 
-def test_eval_restores_the_policy_in_another_process(finished, tmp_path):
+def test_eval_restores_the_policy_in_another_process(undisturbed, tmp_path):
     """The same goals, k and seed as the run's own final evaluation: the same figures."""
     out = tmp_path / "eval.json"
-    words = ["eval", "--run", str(finished[0]), "--k", "0,1", "--goals", "2", "--json", str(out)]
+    words = ["eval", "--run", str(undisturbed), "--k", "0,1", "--goals", "2", "--json", str(out)]
     done = subprocess.run(
         [sys.executable, str(ROOT / "train.py"), *words], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    result, own = (json.loads(path.read_text()) for path in (out, finished[0] / "eval.json"))
+    result, own = (json.loads(path.read_text()) for path in (out, undisturbed / "eval.json"))
     assert result["tasks"] == own["tasks"]
     assert list(result["tasks"]) == ["drawer-open", "drawer-close", "window-open", "window-close"]
     assert {"success_any", "success_last", "return"} <= result["tasks"]["window-close"]["1"].keys()
@@ -157,11 +159,11 @@ def test_eval_restores_the_policy_in_another_process(finished, tmp_path):
     assert "window-close" in done.stdout and "any step" in done.stdout
 
 
-def test_evaluation_does_not_depend_on_what_was_evaluated_before_or_beside(finished):
+def test_evaluation_does_not_depend_on_what_was_evaluated_before_or_beside(undisturbed):
     """Trap 8: a belief that survived from one task to the next would change these figures."""
-    config = load_config(str(finished[0] / "config.yaml"))
+    config = load_config(str(undisturbed / "config.yaml"))
     session = Session(config)
-    policies = [load_policy(finished[0], session).params]
+    policies = [load_policy(undisturbed, session).params]
     evaluator = session.evaluator()
     trial = session.trial("heldout", config.eval.goals)
     first = evaluator.run(policies, trial, (0, 1), seed=0)
@@ -205,7 +207,7 @@ def test_each_preset_runs_two_iterations_at_smoke_size(preset):
         return iteration(state)
 
     program = jax.jit(counted)
-    state = init_run(config, session.learner, jax.random.key(0))
+    state = jax.jit(lambda key: init_run(config, session.learner, key))(jax.random.key(0))
     state, first = program(state)
     before = state.learner.actor_params
     state, second = program(state)

@@ -247,9 +247,18 @@ class FineTuning:
         self.episode = jax.jit(
             make_episode(self.config, self.env, self.learner, self.config.env.horizon)
         )
-        run = init_run(self.config, learner, jax.random.key(options.seed))
-        first = start_state(adapt, self.config, learner, run.learner, trained, jnp.asarray(text))
-        self.run = run.replace(learner=first)
+        # As programs: op by op, each of their hundreds of shapes would be compiled by itself.
+        init = jax.jit(lambda key: init_run(self.config, learner, key))
+        start = jax.jit(
+            lambda fresh, trained, text: start_state(
+                adapt, self.config, learner, fresh, trained, text
+            )
+        )
+        self.own_belief = jax.jit(
+            lambda state, ring, text: own_belief(self.learner, state, ring, text)
+        )
+        run = init(jax.random.key(options.seed))
+        self.run = run.replace(learner=start(run.learner, trained, jnp.asarray(text)))
         self.own_faults = 0
 
     def gather(self) -> None:
@@ -264,7 +273,7 @@ class FineTuning:
         row = np.zeros(goals, np.int32)
         belief = None
         if self.learner.inference is not None:
-            own = own_belief(self.learner, state, self.run.context, jnp.asarray(self.text))
+            own = self.own_belief(state, self.run.context, jnp.asarray(self.text))
             belief = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, goals, *x.shape[1:])), own)
         first = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one policy
         params = PolicyParams(

@@ -29,7 +29,6 @@ from cmrl_jax.config.rules import check_devices
 from cmrl_jax.config.schema import Config, ConfigError, lanes_per_task
 from cmrl_jax.evaluation.scores import fault_warning, format_scores, of_policy, summarise
 from cmrl_jax.evaluation.session import Session, policy_params, prepare_jax
-from cmrl_jax.formats import format_duration
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.checkpoint import full_store, join_run, policy_store, split_run
 from cmrl_jax.storage.run_dir import write_text
@@ -379,7 +378,6 @@ class _Run:
         }
         write_text(self.run_dir / "eval.json", json.dumps(result, indent=2) + "\n")
         self.say(format_scores(summary))
-        self.say(f"done in {format_duration(self.wall)}: {self.run_dir}")
         return summary
 
     def check_stop(self) -> None:
