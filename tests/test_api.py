@@ -4,7 +4,6 @@ import json
 import signal
 import threading
 
-import numpy as np
 import pytest
 from run_helpers import ITERATIONS
 
@@ -159,10 +158,11 @@ def test_a_run_that_is_not_there_is_one_cause_and_one_cure(tmp_path, results):
 
 def test_an_environment_is_pure_functions_of_one_lane():
     import jax
+    import jax.numpy as jnp
 
     env = cj.make_env(physics="native")
-    state = env.reset(jax.random.key(0), np.int32(2))
-    assert env.step(state, np.zeros(4)).obs.shape == state.obs.shape == (39,)
+    state = env.reset(jax.random.key(0), jnp.int32(2))
+    assert env.step(state, jnp.zeros(4)).obs.shape == state.obs.shape == (39,)
     with pytest.raises(cj.ConfigError, match="observation mode .nosuch"):
         cj.make_env(obs_mode="nosuch")
 

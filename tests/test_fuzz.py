@@ -29,13 +29,21 @@ from cmrl_jax.config.schema import ConfigError
 TIMES = int(os.environ.get("FUZZ", "1"))
 
 
+SLOW_MACHINES = (
+    HealthCheck.too_slow,
+    HealthCheck.data_too_large,
+    HealthCheck.filter_too_much,
+    HealthCheck.function_scoped_fixture,
+)
+
+
 def examples(count: int) -> settings:
     return settings(
         max_examples=count * TIMES,
         derandomize=TIMES == 1,
         deadline=None,
         database=None,
-        suppress_health_check=[check for check in HealthCheck],
+        suppress_health_check=SLOW_MACHINES,
     )
 
 

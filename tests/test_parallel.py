@@ -46,7 +46,9 @@ def assert_close_training(run, other):
                 figures = [
                     float(text) if text else np.nan for text in (row[column], expected[column])
                 ]
-                np.testing.assert_allclose(*figures, tolerance, tolerance / 10, err_msg=column)
+                np.testing.assert_allclose(
+                    *figures, rtol=tolerance, atol=tolerance / 10, err_msg=column
+                )
     leaves, meta = checkpoint_leaves(run)
     expected, expected_meta = checkpoint_leaves(other)
     assert leaves.keys() == expected.keys()

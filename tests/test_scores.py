@@ -70,7 +70,7 @@ def test_means_over_goals_and_draws():
 def test_a_rate_has_wilsons_interval_and_a_return_its_own():
     own, figures = SCORES[2], summarise(of_policy(SCORES, 1), TASKS)["window-close"]["2"]
     goals = own.success_any.shape[2]
-    expected = wilson_interval(own.success_any[1, 1].mean(), goals)
+    expected = wilson_interval(float(own.success_any[1, 1].mean()), goals)
     assert figures["interval_95"]["success_any"] == pytest.approx(list(expected))
     low, high = figures["interval_95"]["return"]
     assert low < figures["return"] < high

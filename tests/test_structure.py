@@ -81,7 +81,8 @@ def imports(path: Path, top: bool = False) -> Iterator[str]:
             assert node.level == 0, f"{path}: relative import"
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
-            yield from (x.value for x in node.args if isinstance(x, ast.Constant))
+            constants = [x.value for x in node.args if isinstance(x, ast.Constant)]
+            yield from (value for value in constants if isinstance(value, str))
 
 
 def own(name: str, top: bool = False) -> set[str]:
