@@ -33,14 +33,6 @@ from envs.places import DATA
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 
-RESET_BOX = {
-    "drawer-open": ((-0.1, 0.9, 0.0), (0.1, 0.9, 0.0)),
-    "drawer-close": ((-0.1, 0.9, 0.0), (0.1, 0.9, 0.0)),
-    "window-open": ((-0.1, 0.7, 0.16), (0.1, 0.9, 0.16)),
-    "window-close": ((0.0, 0.75, 0.2), (0.0, 0.9, 0.2)),
-}
-"""Lowest and highest fixture position (m) of each task; Meta-World's `_random_reset_space`."""
-
 _PACKAGED = DATA / "goal_sets.npz"
 _CACHE_VARIABLE = "CMRL_JAX_CACHE"
 

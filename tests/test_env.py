@@ -7,11 +7,11 @@ import pytest
 from env_fixtures import GOALS, GOALS_A_TASK, LANE_GOALS, LANE_TASKS, LANES
 
 import envs
-from envs.goal_sets import RESET_BOX, load_goal_set
+from envs.goal_sets import load_goal_set
 from envs.parity.parts import draw_noise, port_episodes, reference_episodes
 from envs.parity.reference import ReferenceEnv
 from envs.sawyer import OBJECT, Ml4Env
-from envs.tasks import TASKS
+from envs.tasks import SPECS, TASKS
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +83,10 @@ def test_origin_is_where_the_first_step_shows_the_object():
 
 def test_random_starts_are_fresh_and_inside_the_reset_box(port):
     keys = jax.random.split(jax.random.key(0), 200)
-    for i, task in enumerate(TASKS):
+    for i, spec in enumerate(SPECS):
         states = jax.vmap(port.env.reset, (0, None))(keys, jnp.int32(i))
         places = np.asarray(states.physics.placement)
-        low, high = np.array(RESET_BOX[task], np.float32)
+        low, high = np.array((spec.placement_low, spec.placement_high), np.float32)
         assert (places >= low).all() and (places <= high).all()
         free = high > low
         assert (np.ptp(places, axis=0)[free] > 0.9 * (high - low)[free]).all()

@@ -12,7 +12,10 @@ import pytest
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
 
 from envs import goal_names, goal_sets
-from envs.goal_sets import RESET_BOX, SEEDS, TASKS, draw_goals, load_goal_set
+from envs.goal_sets import SEEDS, TASKS, draw_goals, load_goal_set
+from envs.tasks import SPECS
+
+BOXES = {spec.name: (spec.placement_low, spec.placement_high) for spec in SPECS}
 
 
 def rand_vecs(tasks, name):
@@ -54,7 +57,7 @@ def test_sets_are_complete_distinct_and_inside_the_reset_boxes(name):
     assert goals.shape == (4, 50, 3) and goals.dtype == np.float64
     for task, places in zip(TASKS, goals, strict=True):
         assert len(np.unique(places, axis=0)) == 50
-        low, high = np.array(RESET_BOX[task])
+        low, high = np.array(BOXES[task])
         assert np.all(places >= low) and np.all(places <= high)
         moves = high > low
         assert np.all(np.ptp(places, axis=0)[moves] > 0.8 * (high - low)[moves])
@@ -65,7 +68,7 @@ def test_reset_boxes_are_metaworlds():
         env = ALL_V3_ENVIRONMENTS[f"{task}-v3"]()
         space = env._random_reset_space
         assert space is not None
-        np.testing.assert_array_equal([space.low, space.high], RESET_BOX[task])
+        np.testing.assert_array_equal([space.low, space.high], BOXES[task])
 
 
 def test_train_and_heldout_share_no_goal():

@@ -91,7 +91,7 @@ def test_cells_with_sentences_of_a_table_name_the_table(run, tmp_path):
 
 
 CHANGED = {
-    "tasks.train": ("window-open",), "tasks.test": (), "env.physics": "mjx", "env.impl": "warp",
+    "tasks.train": ("window-open",), "tasks.test": (), "env.physics": "mjx",
     "env.variation": "fixed_50", "env.obs_mode": "canonical", "collect.initial": "prior",
     "collect.context_source": "all", "collect.context_lanes": "prior", "sac.variant": "v",
     "sac.alpha": "shared", "sac.reward_norm": "global", "sac.task_reduce": "sum",

@@ -20,6 +20,7 @@ from envs.physics.mjx.backend import (
     SUBSTEPS,
     MjxPhysics,
 )
+from envs.physics.mjx.quiet import mjx
 from envs.physics.mjx.solver import solve
 from envs.physics.model import JOINTS
 from envs.tasks import SCENE_ID, TASKS
@@ -45,7 +46,7 @@ def bench_stages(lane_counts: tuple[int, ...], report: Report) -> None:
     def with_solver(state: Any, scene: Any) -> jax.Array:
         data, (weld, limits, cones) = constraints(state, scene)
         rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), weld, limits)
-        mass = jnp.eye(JOINTS).at[:ROBOT_JOINTS, :ROBOT_JOINTS].set(data._impl.M)
+        mass = jnp.eye(JOINTS).at[:ROBOT_JOINTS, :ROBOT_JOINTS].set(mjx.full_m(physics.model, data))
         force = jnp.append(data.qfrc_smooth, 0.0)
         smooth = jnp.append(data.qacc_smooth, 0.0)
         budget = (weld.weight.shape[0], SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS)

@@ -148,7 +148,7 @@ def check_resumable(saved: Mapping[str, Any], config: Config, run: Path) -> None
 def recorded(saved: Mapping[str, Any]) -> dict[str, Any]:
     """A run's config by dotted name. A key it lacks had its default, but for one: `canonical` runs
     once took their origin from the reset observation, which need not show where the object is."""
-    record = dict(_flat(saved))
+    record = {key: value for key, value in _flat(saved) if key not in RETIRED}
     if record.get("env.obs_mode") == "canonical":
         record.setdefault("env.origin", "reset observation")
     return record
@@ -209,6 +209,15 @@ def read_yaml(path: Path) -> tuple[dict[str, Any], _Source]:
     return data, _Source(str(path), lines)
 
 
+# Keys that older configurations name, each with the one value that was ever built.
+RETIRED = {
+    "env.impl": "jax",
+    "model.router_shared": False,
+    "encoder.z_resample": "episode",
+    "collect.own_context": False,
+}
+
+
 def _section(cls: type, data: Any, prefix: str, source: _Source) -> Any:
     """A dataclass of the schema from plain data; None, an empty section, means its defaults."""
     if data is None:
@@ -221,6 +230,11 @@ def _section(cls: type, data: Any, prefix: str, source: _Source) -> Any:
     values = {}
     for key, value in data.items():
         dotted = f"{prefix}{key}"
+        if dotted in RETIRED:
+            if value != RETIRED[dotted]:
+                cause = f"{dotted} got {_show(value)}{source(dotted)}, which was never built"
+                raise ConfigError(cause, "remove the key")
+            continue
         if key not in hints:
             _unknown(str(key), dotted, cls, source(dotted))
         if is_dataclass(hints[key]):

@@ -24,17 +24,6 @@ from cmrl_jax.config.schema import (
 from envs.command_line import LARGEST
 from envs.goal_names import seed_of
 
-# Options of the schema whose code is not there yet: refused by name, so that nobody trains for an
-# hour on a switch that does nothing.
-NOT_BUILT = {
-    # Contacts and solver are this project's own JAX code; Warp would step a scene as a whole.
-    "env.impl": ("warp",),
-    "model.critic": ("hlgauss",),
-    "model.router_shared": (True,),
-    "encoder.z_resample": ("step",),
-    "collect.own_context": (True,),
-}
-
 
 def validate(config: Config) -> None:
     """The rules that need more than one key, and the bounds of each.
@@ -43,11 +32,6 @@ def validate(config: Config) -> None:
         ConfigError: with the cause and the cure, for the first rule that is broken.
     """
     _check_bounds(config)
-    for name, f, value in leaves(config):
-        if value in NOT_BUILT.get(name, ()):
-            shown = str(value).lower() if isinstance(value, bool) else value
-            default = str(f.default).lower() if isinstance(f.default, bool) else f.default
-            raise ConfigError(f"{name} {shown} is not built yet", f"use {name}: {default}")
     _check_tasks(config)
     check_goal_table(config.goals.table)
     _check_model(config)

@@ -78,7 +78,6 @@ class EnvConfig:
     physics: Literal["mjx", "native"] = doc(
         "mjx", "mjx: on the device; native: MuJoCo C on the host, Meta-World's own contacts"
     )
-    impl: Literal["jax", "warp"] = doc("jax", "MJX implementation")
     horizon: int = doc(
         200,
         "control steps an episode lasts; a time limit, never a terminal",
@@ -120,12 +119,11 @@ class ModelConfig:
     router_input: Literal["z*obs", "z"] = doc("z*obs", "what the router sees")
     trunk_input: Literal["obs", "obs_z"] = doc("obs", "what the trunk sees")
     router_temperature: float = doc(1.0, "softmax temperature of the routing", above=0)
-    router_shared: bool = doc(False, "one router for actor and critics")
     modular_actor: bool = doc(True, "soft-modular actor (false: MLP actor)")
     modular_critic: bool = doc(True, "soft-modular critics (false: MLP critics)")
     norm: Literal["none", "layer"] = doc("layer", "LayerNorm inside actor and critics")
     init: Literal["flax", "official"] = doc("flax", "initialisation scheme")
-    critic: Literal["mse", "c51", "hlgauss"] = doc("mse", "critic head and loss")
+    critic: Literal["mse", "c51"] = doc("mse", "critic head and loss")
     critic_bins: int = doc(51, "bins of the categorical critic", low=2)
     critic_v_max: float = doc(12.5, "the categorical critic's support is [-v_max, v_max]", above=0)
     critic_agg: Literal["min", "mean"] = doc("mean", "target distribution over the twin critics")
@@ -153,7 +151,6 @@ class EncoderConfig:
         "contrastive: which task's experience and which task's text belong together",
     )
     aux_weight: float = doc(0.1, "weight of the auxiliary loss")
-    z_resample: Literal["episode", "step"] = doc("episode", "when z is redrawn in a rollout")
 
 
 @dataclass(frozen=True)
@@ -207,7 +204,6 @@ class CollectConfig:
     context_source: Literal["recent", "all"] = doc("recent", "context from last episodes, or all")
     context_episodes: int = doc(2, "episodes a lane that the recent context ring holds", above=0)
     context_lanes: Literal["all", "prior"] = doc("all", "lanes that write to the context ring")
-    own_context: bool = doc(False, "posterior lanes use their own last episode")
 
 
 @dataclass(frozen=True)

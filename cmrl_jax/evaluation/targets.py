@@ -81,7 +81,6 @@ IDLE = (
     "collect.context_source",
     "collect.context_episodes",
     "collect.context_lanes",
-    "collect.own_context",
     "sac.variant",
     "sac.alpha",
     "sac.alpha_init",

@@ -29,9 +29,7 @@ def evaluation_config(run: Path, physics: Literal["mjx", "native"] | None) -> Co
     config = run_config(run)
     if physics is None:
         return config
-    # A policy does not know its simulator. impl belongs to mjx, and its default serves both.
-    impl = config.env.impl if physics == config.env.physics else "jax"
-    return replace(config, env=replace(config.env, physics=physics, impl=impl))
+    return replace(config, env=replace(config.env, physics=physics))
 
 
 def lane_budget(options: EvalOptions) -> int:

@@ -51,21 +51,6 @@ def init_belief(lead: tuple[int, ...], latent_dim: int) -> Belief:
     return Belief(NaturalSums(zeros, zeros, jnp.zeros(lead, jnp.float32)))
 
 
-def reset_belief(belief: Belief, where: jax.Array) -> Belief:
-    """Empties the belief of the lanes at which `where` (lane, ...) is true."""
-
-    def reset(x: jax.Array) -> jax.Array:
-        return jnp.where(where.reshape(where.shape + (1,) * (x.ndim - where.ndim)), 0.0, x)
-
-    return jax.tree.map(reset, belief)
-
-
-def prior(lead: tuple[int, ...], latent_dim: int) -> Gaussian:
-    """N(0, I) for the leading dims `lead`."""
-    shape = (*lead, latent_dim)
-    return Gaussian(jnp.zeros(shape, jnp.float32), jnp.ones(shape, jnp.float32))
-
-
 @dataclass(frozen=True)
 class ContextInference:
     """Pure functions of one configuration; `goal` (..., G) and `goal_mask` (...) may be None

@@ -20,7 +20,7 @@ from cmrl_jax import parallel
 from cmrl_jax.algorithms.cmrl.diagnostics import make_diagnose
 from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
 from cmrl_jax.algorithms.common import replay as rings
-from cmrl_jax.algorithms.common.replay import ContextState, ReplayState, Transition
+from cmrl_jax.algorithms.common.replay import ReplayState, Transition
 from cmrl_jax.algorithms.common.rollout import correlated_noise, rollout
 from cmrl_jax.config.schema import Config, lane_groups, lanes_per_task
 from cmrl_jax.nn import normalizers
@@ -36,7 +36,7 @@ class RunState(struct.PyTreeNode):
 
     learner: TrainState
     replay: ReplayState
-    context: ContextState
+    context: ReplayState
     key: jax.Array
     iteration: jax.Array  # () int32, iterations done
 

@@ -63,10 +63,6 @@ class ReplayState:
     action_size: int = struct.field(pytree_node=False)
 
 
-# The context ring differs in who writes to it and how long its rows live, not in its layout.
-ContextState = ReplayState
-
-
 @struct.dataclass
 class Batch:
     """Transitions for the Bellman update: obs, next_obs (row, batch, obs), action (row, batch,
@@ -119,7 +115,7 @@ def init_context(
     lanes_per_task: int,
     obs_size: int,
     action_size: int,
-) -> ContextState:
+) -> ReplayState:
     """An empty ring for the last `episodes` episodes (of `horizon` steps) of the eligible lanes.
 
     Raises:
