@@ -13,8 +13,9 @@ train: $(STAMP)
 	$(PY) train.py --config $(CONFIG) $(ARGS)
 
 # Two processes, since a test that compiles keeps one core busy; tests of a file share fixtures.
+# In the order that tests/conftest.py puts them.
 test: $(STAMP)
-	$(PY) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
+	$(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(STAMP)
 	$(PY) -m ruff check .
@@ -33,7 +34,7 @@ parity: $(STAMP)
 # The newest versions: make lock ARGS=--upgrade. Names and versions only, the same for 3.12 and
 # 3.13 (checked by a dry run for each that uv finds); the cuda extra stays outside.
 lock: $(STAMP)
-	$(PY) -m uv pip compile pyproject.toml --extra dev --extra viz --python-version 3.12 \
+	$(PY) -m uv pip compile pyproject.toml --extra dev --extra text --extra viz --python-version 3.12 \
 		--python-platform linux --strip-extras --no-header --no-annotate --no-emit-index-url \
 		--output-file requirements.lock --quiet $(ARGS)
 	for version in 3.12 3.13; do \

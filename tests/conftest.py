@@ -14,9 +14,16 @@ from cmrl_jax.cli.main import main  # imports neither jax nor mujoco
 
 CACHE = Path(__file__).resolve().parent.parent / ".cache" / "jax-tests"
 
+# Files of minutes: begun first, so that at the end no process is left with one of them.
+LONG = ("train", "finetune", "learner", "faults", "process", "parallel", "api", "film", "sweep")
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONG)
 
 
 @pytest.fixture

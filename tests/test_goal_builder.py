@@ -1,6 +1,7 @@
 """`train.py goals`: MiniLM computes what torch does; tables are reproducible, shown and drawn."""
 
 import hashlib
+import importlib.metadata
 import json
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from safetensors.numpy import load_file, save_file
 
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.schema import TASKS, ConfigError
-from cmrl_jax.text import goal_builder, minilm
+from cmrl_jax.text import encoders, goal_builder, minilm
 from cmrl_jax.text.encoders import embed, file_sha256
 from cmrl_jax.text.goal_files import table_path
 from cmrl_jax.text.goals import load_goals, read_table
@@ -217,3 +218,18 @@ def test_figure_is_a_picture(tmp_path, refused):
     assert "no ending of a picture" in cause and ".png" in cure
     assert main(["goals", "--figure", str(tmp_path / "new" / "f.png")]) == 0
     assert (tmp_path / "new" / "f.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("package", encoders.PACKAGES)
+def test_a_missing_extra_is_one_cause_and_one_cure(monkeypatch, package):
+    version = importlib.metadata.version
+
+    def found(name):
+        if name == package:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", found)
+    with pytest.raises(ConfigError) as raised:
+        encoders.embed(["shut it"], "minilm-l6-v2")
+    assert package in raised.value.cause and raised.value.cure == "pip install 'cmrl-jax[text]'"

@@ -198,7 +198,8 @@ def test_private_parts_of_libraries_stay_private():
 
 def test_what_we_import_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    declared = project["dependencies"] + project["optional-dependencies"]["viz"]
+    extras = project["optional-dependencies"]
+    declared = project["dependencies"] + extras["text"] + extras["viz"]
     names = {re.split(r"[\[<>=]", requirement)[0].lower() for requirement in declared}
     as_imported = {
         "yaml": "pyyaml",
@@ -239,7 +240,7 @@ def test_lock_holds_names_and_versions_only():
     assert not [name for name in locked if re.match(r"torch|nvidia|triton|jax-cuda|warp", name)]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    for requirement in project["dependencies"] + extras["dev"] + extras["viz"]:
+    for requirement in project["dependencies"] + extras["dev"] + extras["text"] + extras["viz"]:
         assert re.split(r"[\[<>=]", requirement)[0].lower() in locked, requirement
 
 

@@ -42,7 +42,7 @@ def load_tokenizer(positions: int) -> Tokenizer:
         from transformers import CLIPTokenizer
     except ImportError as error:
         raise ConfigError(
-            f"the tokenizer is missing: {error}", "pip install transformers"
+            f"the tokenizer is missing: {error}", "pip install 'cmrl-jax[text]'"
         ) from None
     vocabulary, merges = read_bpe(content)
     # Annotated as lines of text, handed on to a model that takes pairs.

@@ -8,6 +8,7 @@ Needed to make a table or to embed a sentence of one's own, never to train.
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 from cmrl_jax.config.schema import TEXT_ENCODERS, ConfigError
 from cmrl_jax.text import minilm
 
+PACKAGES = ("transformers", "safetensors", "huggingface-hub")  # the extra `text`
 _OTHER_CLIP = re.compile(r"clip-[0-9a-f]{12}")
 
 
@@ -76,13 +78,24 @@ def find_encoder(name: str, weights: Path | None = None) -> Encoder:
         weights: directory with the model; None for the place where each is published.
 
     Raises:
-        ConfigError: no encoder of that name, or its weights are not there.
+        ConfigError: no encoder of that name, the extra `text` is not installed, or the weights
+            are not there.
     """
-    if name == "minilm-l6-v2":
-        return _minilm(name, weights)
-    if name == "clip-vit-b-32" or _OTHER_CLIP.fullmatch(name):
-        return _clip(name, weights)
-    raise ConfigError(f"{name!r} is no text encoder", f"use one of {', '.join(TEXT_ENCODERS)}")
+    is_clip = name == "clip-vit-b-32" or _OTHER_CLIP.fullmatch(name)
+    if name != "minilm-l6-v2" and not is_clip:
+        raise ConfigError(f"{name!r} is no text encoder", f"use one of {', '.join(TEXT_ENCODERS)}")
+    _check_packages()
+    return _clip(name, weights) if is_clip else _minilm(name, weights)
+
+
+def _check_packages() -> None:
+    """Whether the extra `text` is installed, which training needs nothing of."""
+    for package in PACKAGES:
+        try:
+            importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            cause = f"a text encoder needs the package {package}, which is not installed"
+            raise ConfigError(cause, "pip install 'cmrl-jax[text]'") from None
 
 
 def _minilm(name: str, weights: Path | None) -> Encoder:

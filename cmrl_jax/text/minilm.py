@@ -124,7 +124,7 @@ def encode(directory: Path, sentences: Sequence[str]) -> np.ndarray:
         from transformers import PreTrainedTokenizerFast
     except ImportError as error:
         raise ConfigError(
-            f"the tokenizer is missing: {error}", "pip install transformers"
+            f"the tokenizer is missing: {error}", "pip install 'cmrl-jax[text]'"
         ) from None
     tokenizer = PreTrainedTokenizerFast(tokenizer_file=str(directory / "tokenizer.json"))
     longest = read_json(directory / "sentence_bert_config.json", CURE)["max_seq_length"]
