@@ -7,15 +7,21 @@ ARGS =
 PY = $(VENV)/bin/python
 STAMP = $(VENV)/.cmrl-installed
 
-.PHONY: train test lint smoke bench parity lock env
+.PHONY: train test test-all lint smoke bench parity lock env
 
 train: $(STAMP)
 	$(PY) train.py --config $(CONFIG) $(ARGS)
 
 # Two processes, since a test that compiles keeps one core busy; tests of a file share fixtures.
-# In the order that tests/conftest.py puts them.
+# In the order that tests/conftest.py puts them. Those marked slow, a minute and more each, are left
+# to `make test-all`.
+PYTEST = $(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
 test: $(STAMP)
-	$(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(PYTEST) -m "not slow" $(ARGS)
+
+test-all: $(STAMP)
+	$(PYTEST) $(ARGS)
 
 lint: $(STAMP)
 	$(PY) -m ruff check .

@@ -5,6 +5,7 @@ Set before jax is imported, as environment variables, so that subprocesses of te
 
 import importlib
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -16,6 +17,10 @@ CACHE = Path(__file__).resolve().parent.parent / ".cache" / "jax-tests"
 
 # Files of minutes: begun first, so that at the end no process is left with one of them.
 LONG = ("train", "finetune", "learner", "faults", "process", "parallel", "api", "film", "sweep")
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # Ignored by a shell that began the tests in the background, and so by every run they begin.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))

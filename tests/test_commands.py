@@ -11,7 +11,10 @@ from types import SimpleNamespace
 import pytest
 
 from cmrl_jax import commands
+from cmrl_jax.cli import train
 from cmrl_jax.commands import command
+from cmrl_jax.config.schema import Config
+from cmrl_jax.stop import Stop
 from cmrl_jax.storage import run_dir
 
 ROOT = Path(__file__).parent.parent
@@ -41,11 +44,12 @@ def test_a_shell_reads_back_what_was_meant(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_commands_to_go_on_with_a_run_are_quoted(name):
-    from cmrl_jax.training.trainer import _Run
-
+def test_commands_to_go_on_with_a_run_are_quoted(name, replace_module, capsys):
+    outcome = SimpleNamespace(is_finished=False, iteration=3)
+    replace_module("cmrl_jax.training.trainer", SimpleNamespace(train=lambda **_: outcome))
+    assert train._in_console(Config(), Path(name), Stop(), False) == 0
+    stopped = capsys.readouterr().out.partition("go on with: ")[2]
     error = run_dir.cannot_write(Path(name), OSError(errno.ENOSPC, "No space left on device"))
-    stopped = _Run.resume_command(SimpleNamespace(run_dir=Path(name)))  # pyright: ignore
     for said in (error.cure.partition(": ")[2], stopped):
         assert shlex.split(said)[-3:] == ["--run", name, "--resume"]
 

@@ -22,6 +22,7 @@ def diagnosed(variant):
     return made.learner, state, ring, diagnose(state, ring, ring, KEY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["cmrl", "pearl", "mtsac"])
 def test_gradient_shares_are_those_of_single_tasks(variant):
     learner, state, ring, figures = diagnosed(variant)

@@ -27,6 +27,7 @@ def compiled(monkeypatch, port):
     monkeypatch.setattr(parity_parts, "Port", same)
 
 
+@pytest.mark.slow
 def test_all_parts(compiled, tmp_path, capsys):
     file = tmp_path / "parity.json"
     assert parity.main([*RUN, "--json", str(file)]) == 0

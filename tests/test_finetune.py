@@ -153,8 +153,8 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         (["--task", "window-close", "--adapt", "z,all,z"], "--adapt names z twice", "once"),
     ],
 )
-def test_mistakes_are_refused(undisturbed_modular, refused, words, cause, cure):
-    got = refused("finetune", "--run", str(undisturbed_modular), *words)
+def test_mistakes_are_refused(undisturbed, refused, words, cause, cure):
+    got = refused("finetune", "--run", str(undisturbed), *words)
     assert cause in got[0] and cure in got[1]
 
 
@@ -220,28 +220,29 @@ def test_what_a_run_could_be_trained_with_can_be_adapted(adapt):
     ],
 )
 def test_a_figure_that_cannot_be_drawn_is_refused_first(
-    undisturbed_modular, refused, tmp_path, monkeypatch, figure, cause, cure
+    undisturbed, refused, tmp_path, monkeypatch, figure, cause, cure
 ):
     if "matplotlib" in cause:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setitem(sys.modules, "matplotlib.backend_bases", None)
     monkeypatch.setattr(finetune_cli, "finetune_run", lambda *_: pytest.fail("it went on"))
-    words = ["--task", "window-close", "--figure", str(tmp_path / figure)]
-    got = refused("finetune", "--run", str(undisturbed_modular), *words)
+    words = ["--task", "window-close", "--adapt", "z", "--figure", str(tmp_path / figure)]
+    got = refused("finetune", "--run", str(undisturbed), *words)
     assert cause in got[0] and cure in got[1]
     assert not any(tmp_path.glob("f.*"))
 
 
-def test_another_goal_table_is_refused(undisturbed_modular, monkeypatch):
+def test_another_goal_table_is_refused(undisturbed, monkeypatch):
     """Before any way to adapt is built."""
     changed = lambda *words: replace(load_goals(*words), sha256="0" * 64)
     monkeypatch.setattr(finetune_cli, "load_goals", changed)
     monkeypatch.setattr(finetune_cli, "FineTuning", lambda *_: pytest.fail("it went on"))
     options = FinetuneOptions("window-close", adapt=("posterior",))
     with pytest.raises(ConfigError, match="another goal table .*\nput that table back"):
-        finetune_cli.finetune_run(undisturbed_modular, options, None, None)
+        finetune_cli.finetune_run(undisturbed, options, None, None)
 
 
+@pytest.mark.slow
 def test_a_short_run_writes_its_curves(undisturbed_modular, tmp_path, capsys):
     """Before any experience every way to adapt scores the trained policy; scratch does not."""
     out = tmp_path / "curves.json"
@@ -258,6 +259,7 @@ def test_a_short_run_writes_its_curves(undisturbed_modular, tmp_path, capsys):
     assert "router" in out and "warning" not in out
 
 
+@pytest.mark.slow
 def test_physics_faults_are_counted_and_told(undisturbed_modular, tmp_path, capsys, monkeypatch):
     """Of read-outs as a mean over lanes, of own episodes as a sum so far."""
     calls = iter(range(10**9))
@@ -304,6 +306,7 @@ def restored(undisturbed_modular):
     return config, trained, text, np.asarray(placements, np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adapt", ["z", "all", "scratch"])
 def test_own_episodes_change_what_is_adapted(restored, adapt):
     """The first as every other: gradient steps of each episode have been made at its read-out."""
@@ -329,6 +332,7 @@ def test_own_episodes_change_what_is_adapted(restored, adapt):
             assert {path.split("/")[0] for path in moved} == set(networks)
 
 
+@pytest.mark.slow
 def test_the_seed_is_that_of_the_networks_that_begin_from_nothing(restored):
     config, trained, text, _ = restored
     first = {}

@@ -1,5 +1,6 @@
 """Leave one task out: what is held out is looked at, and changes nothing that is trained."""
 
+import pytest
 from run_helpers import checkpoint_leaves, native, rows_of, smoke
 
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
@@ -29,6 +30,7 @@ def test_training_is_the_same_with_nothing_held_out(undisturbed, tmp_path):
     assert_same_training(run, undisturbed)
 
 
+@pytest.mark.slow
 def test_training_is_the_same_whatever_is_held_out(tmp_path):
     """With the test above, each of the four tasks is held out once. Evaluated every iteration."""
     sizes = ("--collect.lanes", "4", "--env.horizon", "10", "--train.env_steps", "80")

@@ -98,6 +98,7 @@ def test_switches_that_do_not_work_are_named(name, value):
     check_switches()
 
 
+@pytest.mark.slow
 def test_a_run_that_looks_for_nan_is_the_undisturbed_one(undisturbed, tmp_path):
     """JAX_DEBUG_NANS: that iteration 0 has no losses is no fault."""
     with jax.debug_nans(True):

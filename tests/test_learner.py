@@ -359,6 +359,7 @@ def test_routing_health_matches_loops():
     np.testing.assert_allclose(distance, total / pairs, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("aux", "part", "first_loss"),
     [("recon", "decoder", 1.0), ("contrastive", "goal_net", np.log(TASKS))],

@@ -208,6 +208,7 @@ def test_an_unknown_backend_is_refused_by_name():
         Ml4Env(physics="mjc")
 
 
+@pytest.mark.slow
 def test_two_training_iterations_are_finite_and_repeat():
     config = load_config("smoke.yaml")
     config = replace(config, env=replace(config.env, physics="native", horizon=20))

@@ -61,6 +61,7 @@ def assert_close_training(run, other):
             assert distance <= 0.1 * np.linalg.norm(leaf) + 1e-3, path
 
 
+@pytest.mark.slow
 def test_a_run_begun_on_four_devices_goes_on_with_one(undisturbed_modular, tmp_path):
     run = tmp_path / "run"
     on_four_devices(run, *modular(ITERATIONS - 1))
@@ -69,6 +70,7 @@ def test_a_run_begun_on_four_devices_goes_on_with_one(undisturbed_modular, tmp_p
     assert_close_training(run, undisturbed_modular)
 
 
+@pytest.mark.slow
 def test_a_run_begun_on_one_device_goes_on_with_four(undisturbed_modular, tmp_path):
     run = tmp_path / "run"
     shutil.copytree(undisturbed_modular, run)

@@ -172,6 +172,7 @@ def ignored_reward(monkeypatch):
     monkeypatch.setattr(losses, "td_target", lambda r, d, v: right(0.0 * r, d, v))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mutate",
     [flipped_actor_loss, frozen_encoder, ignored_reward],

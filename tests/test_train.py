@@ -83,6 +83,7 @@ def test_the_same_seed_gives_the_same_csv_and_another_seed_does_not(undisturbed,
     assert first["train/drawer-open/return"] != other["train/drawer-open/return"]
 
 
+@pytest.mark.slow
 def test_resume_equals_an_undisturbed_run_bit_for_bit(finished, tmp_path):
     run = tmp_path / "run"
     assert smoke(run, "--train.env_steps", "600") == 0
@@ -131,6 +132,7 @@ def test_sigterm_saves_and_leaves_with_code_0_and_the_resume_command(undisturbed
         assert store.read_meta()["iteration"] == len(rows) >= 2
 
 
+@pytest.mark.slow
 def test_sigterm_during_the_compile_stops_before_the_first_iteration(tmp_path):
     """A signal before the loop leaves the untrained state and a command that goes on with it."""
     run = tmp_path / "run"
@@ -176,10 +178,13 @@ def test_evaluation_does_not_depend_on_what_was_evaluated_before_or_beside(undis
     np.testing.assert_allclose(alone[1].returns[:, :, 0], first[1].returns[:, :, 0], rtol=1e-4)
 
 
-PRESETS = ("ml4", "ml4-grounded", "pearl", "cmrl-paper", "mtsac", "sac", "ml4-large")
+PRESETS = ("ml4", "pearl", "mtsac", "sac")
+SLOW = ("ml4-grounded", "cmrl-paper", "ml4-large")
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    "preset", [*PRESETS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+)
 def test_each_preset_runs_two_iterations_at_smoke_size(preset):
     config = load_config(f"{preset}.yaml")
     small = load_config("smoke.yaml")
