@@ -386,14 +386,13 @@ def test_the_auxiliary_loss_reaches_the_encoder_side_alone(ring, aux, part, firs
         )
         if not np.allclose(a, b, rtol=1e-4, atol=1e-6)
     }
-    assert {part, "transition_net"} <= moved
-    # Heads start near zero: nothing is told apart yet.
+    assert {part, "transition_net"} <= moved  # heads start near zero: nothing is told apart yet
     assert float(metrics["aux_loss"]) == pytest.approx(first_loss, abs=0.05)
 
 
 def test_rows_are_averaged_per_task():
-    means = per_task(jnp.array([1.0, 3.0, 7.0]), jnp.array([2, 2, 0]), 3)
-    np.testing.assert_array_equal(means, [7.0, np.nan, 2.0])
+    rows, tasks = jnp.array([1.0, 3.0, 7.0]), jnp.array([2, 2, 0])
+    np.testing.assert_array_equal(per_task(rows, tasks, 3), [7.0, np.nan, 2.0])
 
 
 def test_goal_table_must_fit_the_training_tasks():
