@@ -1,19 +1,19 @@
 """The library: what `import cmrl_jax` offers, in terms of the same parts as the command line.
 
-Nothing here prints, installs a signal handler or ends the process, and everything may be called
-from any thread, again and again.
+Loggers apart nothing here prints, nothing installs a signal handler or ends the process, and
+everything may be called from any thread, again and again.
 """
 
 from __future__ import annotations
 
-import csv
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cmrl_jax.config.files import check_resumable, load_config, read_yaml, to_yaml
+from cmrl_jax.config.files import load_config as load_config
+from cmrl_jax.config.files import to_yaml
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config, ConfigError, call_envs
 from cmrl_jax.evaluation.options import EvalOptions, check_options, check_run
@@ -21,25 +21,11 @@ from cmrl_jax.evaluation.results import Evaluation, score
 from cmrl_jax.evaluation.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.evaluation.trials import evaluation_config
 from cmrl_jax.stop import Stop
-from cmrl_jax.storage.run_dir import begun, find_run, new_run
+from cmrl_jax.storage.run_dir import begun, check_same_config, find_run, new_run
 from cmrl_jax.training import trainer
-from cmrl_jax.training.loggers import Console, Logger, TensorBoard
+from cmrl_jax.training.loggers import Console, Logger, with_tensorboard
+from cmrl_jax.training.metrics import read_rows
 from envs.sawyer import Ml4Env
-
-__all__ = [
-    "Agent",
-    "Config",
-    "ConfigError",
-    "Evaluation",
-    "Logger",
-    "Stop",
-    "TrainResult",
-    "evaluate",
-    "load_agent",
-    "load_config",
-    "make_env",
-    "train",
-]
 
 
 @dataclass(frozen=True)
@@ -88,11 +74,7 @@ class TrainResult:
     @property
     def metrics(self) -> list[dict[str, float | None]]:
         """The rows of metrics.csv, oldest first; None where a figure was not taken."""
-        with open(self.run_dir / "metrics.csv", encoding="utf-8", newline="") as file:
-            return [
-                {name: float(text) if text else None for name, text in row.items()}
-                for row in csv.DictReader(file)
-            ]
+        return list(read_rows(self.run_dir / "metrics.csv"))
 
 
 def train(
@@ -122,12 +104,11 @@ def train(
         if run_dir is None:
             raise ConfigError("resume without a run directory", "name it: run_dir=")
         run = find_run(Path(run_dir))
-        if (run / "config.yaml").is_file():
-            check_resumable(read_yaml(run / "config.yaml")[0], config, run)
+        check_same_config(config, run)
     else:
         run = new_run(config.name, None if run_dir is None else Path(run_dir))
     if loggers is None:
-        loggers = [Console(progress=False), *([TensorBoard()] if config.log.tensorboard else [])]
+        loggers = with_tensorboard(Console(progress=False), config)
     with begun(run, to_yaml(config), resume):
         outcome = trainer.train(config, run, loggers, stop, resume)
     return TrainResult(run, outcome.iteration, outcome.is_finished, outcome.evaluation)

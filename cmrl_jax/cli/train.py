@@ -13,7 +13,6 @@ from cmrl_jax.cli.flags import COMMANDS, Parser, parse
 from cmrl_jax.cli.stop_signal import StopSignal
 from cmrl_jax.commands import command, program, shown
 from cmrl_jax.config.files import (
-    check_resumable,
     config_dirs,
     field_types,
     find_config,
@@ -23,7 +22,14 @@ from cmrl_jax.config.files import (
 )
 from cmrl_jax.config.schema import Config, ConfigError, leaves
 from cmrl_jax.stop import Stop
-from cmrl_jax.storage.run_dir import begun, config_stem, find_run, new_run, resumed_run
+from cmrl_jax.storage.run_dir import (
+    begun,
+    check_same_config,
+    config_stem,
+    find_run,
+    new_run,
+    resumed_run,
+)
 from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
 from cmrl_jax.text.goal_files import find_table
 from envs.command_line import typed_path
@@ -83,8 +89,7 @@ def run_train(words: Sequence[str]) -> int:
     _check_extras(config)
     if resume:
         run = resumed_run(config_stem(path), run)
-        if (run / "config.yaml").is_file():
-            check_resumable(read_yaml(run / "config.yaml")[0], config, run)
+        check_same_config(config, run)
     else:
         run = new_run(config_stem(path), run)
     with begun(run, to_yaml(config), resume):
@@ -99,11 +104,11 @@ def _in_console(config: Config, run: Path, stop: Stop, resume: bool) -> int:
     """Trains, and says how it ended; returns the exit code."""
     from cmrl_jax.formats import format_duration
     from cmrl_jax.training import trainer
-    from cmrl_jax.training.loggers import Console, TensorBoard
+    from cmrl_jax.training.loggers import Console, with_tensorboard
 
     # Who cannot be told what happens has left: the run saves and ends.
     console = Console(config.log.progress, on_error=stop.request)
-    loggers = [console, *([TensorBoard()] if config.log.tensorboard else [])]
+    loggers = with_tensorboard(console, config)
     outcome = trainer.train(config=config, run_dir=run, loggers=loggers, stop=stop, resume=resume)
     if outcome.is_finished:
         console.message(f"done in {format_duration(outcome.wall_s)}: {run}")

@@ -16,7 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cmrl_jax.commands import command, quoted
-from cmrl_jax.config.schema import ConfigError, call_envs
+from cmrl_jax.config.files import check_resumable, read_yaml
+from cmrl_jax.config.schema import Config, ConfigError, call_envs
 from cmrl_jax.storage.locks import lock
 from envs.command_line import brief, what_is
 
@@ -138,6 +139,12 @@ def forget_unbegun(run: Path) -> None:
     """
     if not any((run / name).exists() for name in RUN_FILES if name != "config.yaml"):
         (run / "config.yaml").unlink(missing_ok=True)
+
+
+def check_same_config(config: Config, run: Path) -> None:
+    """`check_resumable` against the run's own config.yaml, where it has one."""
+    if (run / "config.yaml").is_file():
+        check_resumable(read_yaml(run / "config.yaml")[0], config, run)
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.formats import format_duration
 from cmrl_jax.streams import Output
 from cmrl_jax.training.metrics import LEADING_COLUMNS, Row
@@ -128,8 +128,8 @@ class TensorBoard(Logger):
     this thread: tensorboardX's own writer queues them, and a killed process loses its queue.
     """
 
-    def __init__(self, directory: Path | None = None):
-        """Events go to `directory`, by default the run directory's `tensorboard/`.
+    def __init__(self) -> None:
+        """Events go to the run directory's `tensorboard/`.
 
         Raises:
             ConfigError: tensorboardX is not installed.
@@ -142,13 +142,13 @@ class TensorBoard(Logger):
                 "log.tensorboard needs the package tensorboardX, which is not installed",
                 "pip install tensorboardX, or set log.tensorboard to false",
             ) from error
-        self._directory, self._record_writer, self._writer = directory, RecordWriter, None
+        self._record_writer, self._writer = RecordWriter, None
         events: Any = event_pb2  # made at run time, so that no type checker knows what is in it
         self._event = events.Event
         self._session_log = events.SessionLog
 
     def start(self, run: RunInfo) -> None:
-        directory = self._directory or run.run_dir / "tensorboard"
+        directory = run.run_dir / "tensorboard"
         self._begun = run.begun
         directory.mkdir(parents=True, exist_ok=True)
         before = list(directory.glob("events.*"))
@@ -186,6 +186,11 @@ class TensorBoard(Logger):
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+
+def with_tensorboard(console: Console, config: Config) -> list[Logger]:
+    """The console, and TensorBoard where `log.tensorboard` asks for it."""
+    return [console, *([TensorBoard()] if config.log.tensorboard else [])]
 
 
 def figure_of(row: Row, name: str, tasks: Iterable[str]) -> float | None:

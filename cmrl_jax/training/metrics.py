@@ -69,9 +69,7 @@ class MetricsCsv:
 
     def rows(self) -> Iterator[dict[str, float | None]]:
         """The rows so far, oldest first; None where a figure was not taken."""
-        with open(self._file.name, encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                yield {name: float(text) if text else None for name, text in row.items()}
+        return read_rows(Path(self._file.name))
 
     def _write(self, line: bytes) -> None:
         self._file.write(line)
@@ -79,6 +77,13 @@ class MetricsCsv:
 
     def close(self) -> None:
         self._file.close()
+
+
+def read_rows(path: Path) -> Iterator[dict[str, float | None]]:
+    """The rows of a metrics.csv, oldest first; None where a figure was not taken."""
+    with open(path, encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            yield {name: float(text) if text else None for name, text in row.items()}
 
 
 def _check_resumable(path: Path, header: bytes, offset: int) -> None:
