@@ -17,32 +17,42 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cmrl_jax.api import (
         Agent,
+        Algorithm,
         Config,
         ConfigError,
         Evaluation,
         Logger,
+        MetaEnv,
         Stop,
+        TrainedAgent,
         TrainResult,
         evaluate,
         load_agent,
         load_config,
         make_env,
+        register_algorithm,
+        register_environment,
         train,
     )
 
 __version__ = "0.1.0"
 __all__ = [
     "Agent",
+    "Algorithm",
     "Config",
     "ConfigError",
     "Evaluation",
     "Logger",
+    "MetaEnv",
     "Stop",
     "TrainResult",
+    "TrainedAgent",
     "evaluate",
     "load_agent",
     "load_config",
     "make_env",
+    "register_algorithm",
+    "register_environment",
     "train",
 ]
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from cmrl_jax.algorithms.base import Agent as Agent
+from cmrl_jax.algorithms.base import Algorithm as Algorithm
 from cmrl_jax.config.files import load_config as load_config
 from cmrl_jax.config.files import to_yaml
 from cmrl_jax.config.rules import validate
@@ -20,16 +22,19 @@ from cmrl_jax.evaluation.options import EvalOptions, check_options, check_run
 from cmrl_jax.evaluation.results import Evaluation, score
 from cmrl_jax.evaluation.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.evaluation.trials import evaluation_config
+from cmrl_jax.registry import make_environment
+from cmrl_jax.registry import register_algorithm as register_algorithm
+from cmrl_jax.registry import register_environment as register_environment
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.run_dir import begun, check_same_config, find_run, new_run
 from cmrl_jax.training import trainer
 from cmrl_jax.training.loggers import Console, Logger, with_tensorboard
 from cmrl_jax.training.metrics import read_rows
-from envs.sawyer import Ml4Env
+from envs.base import MetaEnv as MetaEnv
 
 
 @dataclass(frozen=True)
-class Agent:
+class TrainedAgent:
     """A trained policy, ready to be evaluated.
 
     Attributes:
@@ -63,7 +68,7 @@ class TrainResult:
     evaluation: dict[str, Any] | None
 
     @functools.cached_property
-    def agent(self) -> Agent:
+    def agent(self) -> TrainedAgent:
         """The policy as it was saved last.
 
         Raises:
@@ -114,7 +119,7 @@ def train(
     return TrainResult(run, outcome.iteration, outcome.is_finished, outcome.evaluation)
 
 
-def load_agent(run_dir: str | Path, checkpoint: int | None = None) -> Agent:
+def load_agent(run_dir: str | Path, checkpoint: int | None = None) -> TrainedAgent:
     """The policy of a run.
 
     Args:
@@ -126,11 +131,11 @@ def load_agent(run_dir: str | Path, checkpoint: int | None = None) -> Agent:
     run = find_run(Path(run_dir))
     config = evaluation_config(run, "native")  # reading a policy needs no simulator of its own
     prepare_jax(config)
-    return Agent(run, load_policy(run, Session(config), checkpoint))
+    return TrainedAgent(run, load_policy(run, Session(config), checkpoint))
 
 
 def evaluate(
-    agent: Agent,
+    agent: TrainedAgent,
     tasks: Sequence[str] | None = None,
     k: Sequence[int] | None = None,
     **options: Any,
@@ -162,7 +167,7 @@ def evaluate(
     return score(agent.run, Session(config), agent.policy, chosen)
 
 
-def make_env(config: Config | None = None, **overrides: Any) -> Ml4Env:
+def make_env(config: Config | None = None, **overrides: Any) -> MetaEnv:
     """The environment of a configuration: pure `reset` and `step` of one lane, for vmap and scan.
 
     Args:
@@ -175,4 +180,4 @@ def make_env(config: Config | None = None, **overrides: Any) -> Ml4Env:
     config = config or Config()
     env = replace(config.env, **overrides)
     validate(replace(config, env=env))
-    return call_envs(lambda: Ml4Env(env.goal_observable, env.physics, env.obs_mode))
+    return call_envs(lambda: make_environment(env))

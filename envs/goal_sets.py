@@ -14,7 +14,7 @@ NOTES
 
 from __future__ import annotations
 
-import difflib
+import importlib
 import os
 import pickle
 import zipfile
@@ -30,8 +30,7 @@ from envs.goal_names import GOALS, SEEDS, seed_of
 from envs.npz import write_npz
 from envs.outputs import FORCE_HELP, check_output
 from envs.places import DATA
-
-TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
+from envs.tasks import METAWORLD_TASKS, REGISTRY, TASKS, task_id
 
 _PACKAGED = DATA / "goal_sets.npz"
 _CACHE_VARIABLE = "CMRL_JAX_CACHE"
@@ -57,22 +56,31 @@ def load_goal_set(
             metaworld missing for a fresh set. The message is two lines: cause, cure.
     """
     for task in tasks:
-        if task not in TASKS:
-            close = difflib.get_close_matches(task, TASKS, n=1)
-            meant = f"; did you mean {close[0]!r}?" if close else ""
-            raise ValueError(f"unknown task {task!r}{meant}\nvalid: {', '.join(TASKS)}")
-    seed = seed_of(name)
+        task_id(task)
+    return np.stack([_goals_of(task, name, cache) for task in tasks])
+
+
+def _goals_of(task: str, name: str, cache: str | Path | None) -> np.ndarray:
+    if not REGISTRY[task].is_metaworlds:
+        return _from_reset_box(task, seed_of(name))
     if name in SEEDS:
         packaged = _read(_PACKAGED, "python -m envs.goal_sets writes the packaged file again")
-        return np.stack([_goals(packaged, f"{name}/{task}", _PACKAGED) for task in tasks])
-    return np.stack([_fresh(task, seed, _cache_directory(cache)) for task in tasks])
+        return _goals(packaged, f"{name}/{task}", _PACKAGED)
+    return _fresh(task, seed_of(name), _cache_directory(cache))
+
+
+def _from_reset_box(task: str, seed: int) -> np.ndarray:
+    """Goals of a task that Meta-World does not know: uniform in its reset box."""
+    spec = importlib.import_module(REGISTRY[task].module).TASKS[task]
+    box = spec.placement_low, spec.placement_high
+    return np.random.default_rng(seed).uniform(*box, (GOALS, 3))
 
 
 def draw_goals(task: str, seed: int) -> np.ndarray:
     """Draws the 50 goals of one task with Meta-World's task maker; needs metaworld.
 
     Args:
-        task: one of `TASKS`.
+        task: one of `METAWORLD_TASKS`.
         seed: the maker's seed, up to `goal_names.LARGEST_SEED`. The global numpy stream is left as
             it was.
 
@@ -104,7 +112,8 @@ def draw_goals(task: str, seed: int) -> np.ndarray:
 def write_packaged(path: Path = _PACKAGED) -> None:
     """Draws `train` and `heldout` for every task and writes them to `path`, byte for byte the
     same each time."""
-    write_npz(path, {f"{n}/{t}": draw_goals(t, seed) for n, seed in SEEDS.items() for t in TASKS})
+    sets = [(name, seed, task) for name, seed in SEEDS.items() for task in METAWORLD_TASKS]
+    write_npz(path, {f"{name}/{task}": draw_goals(task, seed) for name, seed, task in sets})
 
 
 def _fresh(task: str, seed: int, cache: Path | None) -> np.ndarray:

@@ -8,6 +8,7 @@ can fill in.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -15,17 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs import rewards
+from envs.goal_sets import load_goal_set
 from envs.physics.backends import make_physics
 from envs.physics.base import Physics, Positions, settled_starts
-from envs.tasks import (
-    HAND_HIGH,
-    HAND_LOW,
-    OBS_HAND_HIGH,
-    OBS_HAND_LOW,
-    SCENE_ID,
-    SPECS,
-)
+from envs.tasks import TASKS
+from envs.tasks.base import HAND_HIGH, HAND_LOW, OBS_HAND_HIGH, OBS_HAND_LOW, RewardInputs
+from envs.tasks.specs import SCENE_ID, SPECS
 
 OBS_SIZE, ACTION_SIZE, FRAME = 39, 4, 18
 HAND, OBJECT, QUATERNION = slice(0, 3), slice(4, 7), slice(7, 11)  # of a frame
@@ -69,7 +65,7 @@ class _TaskData:
 
 
 class Ml4Env:
-    """Static data of the environment.
+    """The environment, a `MetaEnv`; a goal is the fixture's placement (3,), metres.
 
     Args:
         goal_observable: show the target in the last three observation numbers.
@@ -82,6 +78,9 @@ class Ml4Env:
 
     observation_size = OBS_SIZE
     action_size = ACTION_SIZE
+    goal_size = 3
+    tasks = TASKS
+    can_terminate = False  # Meta-World has no terminal states
 
     def __init__(
         self, goal_observable: bool = False, physics: str = "mjx", obs_mode: str = "metaworld"
@@ -93,17 +92,17 @@ class Ml4Env:
         self.obs_mode = obs_mode
         self.physics: Physics = make_physics(physics)
         self.goal_observable = goal_observable
-        self.tasks = _TaskData()
+        self._data = _TaskData()
         self._scene_id = jnp.asarray(SCENE_ID)
 
     def reset(self, key: jax.Array, task_id: jax.Array) -> State:
         """A fresh episode with a random placement of the fixture (Meta-World's reset box)."""
-        low, high = self.tasks.placement_low[task_id], self.tasks.placement_high[task_id]
+        low, high = self._data.placement_low[task_id], self._data.placement_high[task_id]
         return self.reset_to(task_id, low + (high - low) * jax.random.uniform(key, (3,)))
 
     def reset_to(self, task_id: jax.Array, placement: jax.Array) -> State:
         """A fresh episode with the fixture at `placement` (3,), a goal of a named goal set."""
-        tasks = self.tasks
+        tasks = self._data
         task_id = jnp.asarray(task_id, jnp.int32)
         physics = self.physics.start(task_id, placement)
         fixture = self.physics.fixture(self._scene_id[task_id])
@@ -132,7 +131,7 @@ class Ml4Env:
         Zero but for window-close, see the NOTE in `tasks.py`.
         """
         axis = self.physics.fixture(self._scene_id[task_id]).axis
-        return (self.tasks.start_slide - self.tasks.first_obs_slide)[task_id] * axis
+        return (self._data.start_slide - self._data.first_obs_slide)[task_id] * axis
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step; `action` (4,) in [-1, 1]: hand displacement / 0.01 m, finger effort."""
@@ -157,17 +156,17 @@ class Ml4Env:
             )
         obs = jnp.concatenate([_clip_hand(frame), _clip_hand(state.frame), goal])
         fixture = self.physics.fixture(self._scene_id[task_id])
-        start = physics.placement + fixture.offset + self.tasks.handle[task_id]
-        inputs = rewards.RewardInputs(
+        start = physics.placement + fixture.offset + self._data.handle[task_id]
+        inputs = RewardInputs(
             hand=obs[:3],
             tcp=0.5 * (positions.right_tip + positions.left_tip),
-            handle=positions.fixture + self.tasks.handle[task_id],
+            handle=positions.fixture + self._data.handle[task_id],
             slide=positions.slide,
             gripper_effort=action[3],
-            init_tcp=self.tasks.init_tcp[task_id],
-            init_handle=start + fixture.axis * self.tasks.start_slide[task_id],
+            init_tcp=self._data.init_tcp[task_id],
+            init_handle=start + fixture.axis * self._data.start_slide[task_id],
         )
-        values = [reward(inputs) for reward in rewards.REWARDS]
+        values = [spec.reward(inputs) for spec in SPECS]
         pick = lambda i: jnp.stack([value[i] for value in values])[task_id]
         return state.replace(
             physics=physics,
@@ -179,21 +178,30 @@ class Ml4Env:
             steps=state.steps + 1,
         )
 
+    def goals(self, name: str, tasks: Sequence[str] = TASKS) -> np.ndarray:
+        """Placements of a named goal set, see `goal_sets.load_goal_set`."""
+        return load_goal_set(name, tasks)
+
     def _in_mode(self, obs: jax.Array, origin: jax.Array) -> jax.Array:
         if self.obs_mode == "metaworld":
             return obs
         return canonical_obs(obs, origin, self.goal_observable)
 
     def _target(self, physics: Any, task_id: jax.Array) -> jax.Array:
-        return physics.placement + self.tasks.target[task_id]
+        return physics.placement + self._data.target[task_id]
 
     def _frame(
         self, hand: jax.Array, opening: jax.Array, fixture: jax.Array, task_id: jax.Array
     ) -> jax.Array:
         """Hand (3), gripper opening, object position (3), quaternion (4), zeros (7)."""
-        quaternion = jnp.array([1.0, 0.0, 0.0, 0.0]) * self.tasks.has_quaternion[task_id]
-        handle = fixture + self.tasks.handle[task_id]
+        quaternion = jnp.array([1.0, 0.0, 0.0, 0.0]) * self._data.has_quaternion[task_id]
+        handle = fixture + self._data.handle[task_id]
         return jnp.concatenate([hand, opening[None], handle, quaternion, jnp.zeros(7)])
+
+
+def ml4(options: Any) -> Ml4Env:
+    """The environment of a configuration's `env` section."""
+    return Ml4Env(options.goal_observable, options.physics, options.obs_mode)
 
 
 def canonical_obs(obs: jax.Array, origin: jax.Array, goal_observable: bool = False) -> jax.Array:

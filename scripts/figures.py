@@ -16,7 +16,7 @@ sys.path[:0] = [str(ROOT)]
 from cmrl_jax.analysis.inspection_file import FILE as INSPECTION  # noqa: E402
 from cmrl_jax.analysis.plots import plot_adaptation, plot_inspections, plot_learning  # noqa: E402
 from cmrl_jax.config.files import run_config  # noqa: E402
-from cmrl_jax.config.schema import TASKS, ConfigError  # noqa: E402
+from cmrl_jax.config.schema import ConfigError  # noqa: E402
 from cmrl_jax.storage.run_files import (  # noqa: E402
     EVALUATION,
     METRICS,
@@ -26,6 +26,7 @@ from cmrl_jax.storage.run_files import (  # noqa: E402
     read_evaluation,
     read_metrics,
 )
+from envs.tasks import TASKS  # noqa: E402
 from scripts import controls  # noqa: E402
 from scripts.experiments import refused  # noqa: E402
 

@@ -9,7 +9,6 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from cmrl_jax import parallel
-from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.config.files import load_config
 from cmrl_jax.evaluation.session import Session
@@ -83,11 +82,8 @@ def check_iteration(mesh: Any) -> None:
     """The training iteration asks for it: three of twelve lanes a device, batches by transition."""
     config = load_config("smoke.yaml", {"env.physics": "native"})
     session = Session(config)
-    iteration = make_train_iteration(
-        config, session.env, session.learner, session.train_goals, session.train_placements()
-    )
-    init = lambda key: init_run(config, session.learner, key)
-    run = parallel.placed(jax.eval_shape(init, jax.random.key(0)), mesh)
+    iteration = session.algorithm.make_iteration(session.train_placements())
+    run = parallel.placed(jax.eval_shape(session.algorithm.init, jax.random.key(0)), mesh)
     with parallel.using(mesh):
         equations = list(walk(jax.jit(iteration).trace(run).jaxpr.jaxpr))
     shapes = lambda name: {e.outvars[0].aval.shape for e in equations if e.primitive.name == name}

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmrl_jax.algorithms.cmrl.agent import PolicyParams
 from cmrl_jax.config.files import load_config, to_yaml
-from cmrl_jax.evaluation.episode import PolicyParams
-from cmrl_jax.evaluation.session import Session, policy_params
+from cmrl_jax.evaluation.session import Session
 from cmrl_jax.nn.normalizers import init_obs_stats
 from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
@@ -46,7 +46,8 @@ class MovingEnv(Ml4Env):
 
 def random_policy(session: Session, seed: int):
     """PolicyParams with every weight drawn from a normal of std 0.5."""
-    params = policy_params(jax.eval_shape(session.learner.init, jax.random.key(0)))
+    algorithm = session.algorithm
+    params = algorithm.policy_params(jax.eval_shape(algorithm.init, jax.random.key(0)))
     generator = np.random.default_rng(seed)
     draw = lambda x: generator.normal(0, 0.5, x.shape).astype(x.dtype)
     return PolicyParams(

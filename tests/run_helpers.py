@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.algorithms.cmrl.collect import init_run
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config
 from cmrl_jax.evaluation.session import Session
@@ -133,8 +132,7 @@ def leaves_of(tree):
 def abstract_run(run):
     """The shapes of a run's state, by checkpoint item."""
     config = load_config(str(run / "config.yaml"))
-    learner = Session(config).learner
-    return split_run(jax.eval_shape(lambda key: init_run(config, learner, key), jax.random.key(0)))
+    return split_run(jax.eval_shape(Session(config).algorithm.init, jax.random.key(0)))
 
 
 def checkpoint_leaves(run, step=None):

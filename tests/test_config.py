@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from cmrl_jax.algorithms.cmrl.rules import lane_groups
 from cmrl_jax.config.files import (
     FREE_ON_RESUME,
     changed_fields,
@@ -19,7 +20,7 @@ from cmrl_jax.config.files import (
     to_dict,
     to_yaml,
 )
-from cmrl_jax.config.schema import Config, ConfigError, lane_groups, leaves
+from cmrl_jax.config.schema import Config, ConfigError, leaves
 
 CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.yaml"))
 
@@ -190,7 +191,7 @@ def test_ml4_names_every_key_that_matters():
     assert left_out == {
         "model.mlp_hidden", "model.critic_bins", "model.critic_v_max",
         "model.critic_agg", "encoder.aux", "encoder.aux_weight",
-        "env.origin",
+        "env.name", "env.origin",
     }  # fmt: skip
 
 

@@ -26,9 +26,10 @@ from envs.physics.model import (
     load_fixture,
     load_scene,
 )
-from envs.tasks import SPECS, TASKS
+from envs.tasks import TASKS
+from envs.tasks.specs import SPECS
 
-SCENE = {spec.name: spec.scene for spec in SPECS}
+SCENE = {task: spec.scene for task, spec in zip(TASKS, SPECS, strict=True)}
 FINGERS = ("rightclaw_it", "rightpad_geom", "leftclaw_it", "leftpad_geom")
 
 

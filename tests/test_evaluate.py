@@ -36,7 +36,7 @@ def counted(session):
     counting = lambda self, *a, **k: compiles.append(1) or compile_(self, *a, **k)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jax.stages.Lowered, "compile", counting)
-        yield Evaluator(session.config, env, session.learner, LANES, policies=2), traces, compiles
+        yield Evaluator(session.config, env, session.agent, LANES, policies=2), traces, compiles
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def in_plain_python(session, params, trial, episodes, seed):
 
     The posterior is taken afresh over the list of all transitions of a lane.
     """
-    learner, inference = session.learner, session.learner.inference
+    learner, inference = session.algorithm.parts, session.algorithm.parts.inference
     step = jax.jit(jax.vmap(session.env.step))
     posterior_of = jax.jit(inference.posterior)
     lanes = [

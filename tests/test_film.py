@@ -14,11 +14,12 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 from policy_fixtures import save_run
 
+from cmrl_jax.algorithms.cmrl.agent import PolicyParams
 from cmrl_jax.analysis.film import HEIGHT, STRIP, WIDTH, Episode
 from cmrl_jax.analysis.render import FilmedEnv, film_run
 from cmrl_jax.config.files import load_config, to_yaml
 from cmrl_jax.evaluation.evaluator import Evaluator
-from cmrl_jax.evaluation.session import Policy, Session, policy_params
+from cmrl_jax.evaluation.session import Policy, Session
 from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
 from envs.goal_sets import load_goal_set
@@ -36,7 +37,8 @@ def session():
 
 @pytest.fixture(scope="module")
 def params(session):
-    return policy_params(jax.jit(session.learner.init)(jax.random.key(3)))
+    state = jax.jit(session.algorithm.parts.init)(jax.random.key(3))
+    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
 
 
 def test_filmed_states_are_metaworlds():
@@ -68,7 +70,7 @@ def test_a_film_is_the_evaluation_itself(session, params):
     """The returns of the evaluator on an environment that keeps nothing."""
     vectors = dict(zip(session.eval_tasks, session.goals.vectors[:, 0], strict=True))
     films = film_run(session, Policy(params, vectors, {}), 1, 1, "heldout", 5, 20, "a policy")
-    evaluator = Evaluator(session.config, session.env, session.learner, lanes=8, horizon=20)
+    evaluator = Evaluator(session.config, session.env, session.agent, lanes=8, horizon=20)
     scores = evaluator.run([params], session.trial("heldout", 2), (0, 1), seed=5)
     assert [film.task for film in films] == list(session.eval_tasks)
     for row, film in enumerate(films):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
-from cmrl_jax.algorithms.cmrl.learner import make_learner
+from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.common.replay import ContextBatch
 from cmrl_jax.cli import finetune as finetune_cli
 from cmrl_jax.cli.main import main
@@ -20,11 +20,11 @@ from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.evaluation import finetune
 from cmrl_jax.evaluation.finetune import (
     FineTuning,
+    RestrictedLearner,
     adaptation_curve,
     finetune_config,
     free_latent,
     own_belief,
-    restrict,
     start_state,
 )
 from cmrl_jax.evaluation.finetune_options import ADAPT, FinetuneOptions, check_run
@@ -60,7 +60,8 @@ def ring():
 
 @pytest.mark.parametrize("adapt", ["posterior", "router", "all"])
 def test_gradient_steps_change_what_is_adapted_and_nothing_else(made, ring, adapt):
-    update = jax.jit(restrict(made.learner, adapt).update)
+    learner = RestrictedLearner(adapt, tiny_config(), GOALS, 3, 2)
+    update = jax.jit(learner.update)
     state = made.state
     for step in range(3):  # heads start small: a few steps until every leaf has a gradient
         state, _ = update(state, ring, ring, jax.random.key(step))
@@ -80,7 +81,7 @@ def test_a_free_latent_is_one_point_and_learns(ring):
     """Whatever was seen z is the parameter; the critics' loss moves it, and it alone."""
     config = tiny_config(encoder={"information_bottleneck": False})
     latent = free_latent(config.encoder.latent_dim)
-    learner = make_learner(config, GOALS, 3, 2, inference=latent)
+    learner = RestrictedLearner("z", config, GOALS, 3, 2, inference=latent)
     state = jax.jit(learner.init)(jax.random.key(0))
     z = jnp.array([0.3, -0.2])
     params = {"z": z}
@@ -91,7 +92,7 @@ def test_a_free_latent_is_one_point_and_learns(ring):
     )
     drawn = latent.sample_z(jax.random.key(1), latent.posterior_of_belief(params, belief))
     np.testing.assert_array_equal(drawn, np.tile(z, (4, 1)))
-    update = jax.jit(restrict(learner, "z").update)
+    update = jax.jit(learner.update)
     after = state
     for step in range(3):
         after, _ = update(after, ring, ring, jax.random.key(step))
@@ -127,7 +128,7 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         tasks=replace(config.tasks, train=("window-close",), test=()),
         collect=replace(config.collect, lanes=1),
     )
-    learner = make_learner(config, GOALS[:1], 3, 2)
+    learner = Learner(config, GOALS[:1], 3, 2)
     trained = replace(
         made.state,
         actor_params=spread(made.state.actor_params),

@@ -10,11 +10,12 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from cmrl_jax.cli.main import main
-from cmrl_jax.config.schema import TASKS, ConfigError
+from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.text import encoders, goal_builder, minilm
 from cmrl_jax.text.encoders import embed, file_sha256
 from cmrl_jax.text.goal_files import table_path
 from cmrl_jax.text.goals import load_goals, read_table
+from envs.tasks import TASKS
 
 GOLDEN = Path(__file__).parent / "golden" / "tiny_bert.npz"
 

@@ -12,10 +12,13 @@ import pytest
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
 
 from envs import goal_names, goal_sets
-from envs.goal_sets import SEEDS, TASKS, draw_goals, load_goal_set
-from envs.tasks import SPECS
+from envs.goal_sets import SEEDS, draw_goals, load_goal_set
+from envs.tasks import TASKS
+from envs.tasks.specs import SPECS
 
-BOXES = {spec.name: (spec.placement_low, spec.placement_high) for spec in SPECS}
+BOXES = {
+    task: (spec.placement_low, spec.placement_high) for task, spec in zip(TASKS, SPECS, strict=True)
+}
 
 
 def rand_vecs(tasks, name):

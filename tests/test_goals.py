@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cmrl_jax.config.schema import GOAL_ABLATIONS, TASKS, ConfigError
+from cmrl_jax.config.schema import GOAL_ABLATIONS, ConfigError
 from cmrl_jax.text import goal_files
 from cmrl_jax.text.goal_builder import all_vectors, read_prompts, task_cosines
 from cmrl_jax.text.goal_files import PROMPTS_FILE, table_path
 from cmrl_jax.text.goals import check_same_table, load_goals, read_table
+from envs.tasks import TASKS
 
 MINILM = table_path("minilm-l6-v2")
 
@@ -157,7 +158,7 @@ def test_a_run_is_held_to_its_table():
         ("clip-vit-b32", TASKS, "did you mean 'clip-vit-b-32'"),
         ("my-table", TASKS, "the path of an .npz"),
         ("minilm-l6-v2", ("drawer-opne",), "did you mean 'drawer-open'"),
-        ("one-hot", ("door-open",), "no task 'door-open'"),
+        ("one-hot", ("door-open",), "unknown task 'door-open'"),
     ],
 )
 def test_unknown_table_or_task(table, tasks, cause):

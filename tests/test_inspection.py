@@ -61,7 +61,7 @@ def played(session, params, zc):
     step, seen, returns = jax.jit(jax.vmap(session.env.step)), [], 0.0
     for _ in range(HORIZON):
         seen.append(np.asarray(state.obs))
-        action, _ = session.learner.policy(
+        action, _ = session.algorithm.parts.policy(
             params.actor_params, params.obs_stats, state.obs, zc, jax.random.key(0), True
         )
         state = step(state, action)
@@ -118,7 +118,7 @@ def test_z_is_what_the_evaluation_acts_on(session, policy, inspected):
     z = inspected.latents.z.reshape(-1, inspected.latents.z.shape[-1])
     _, returns = played(session, policy, z)
     trial = replace(session.trial("heldout", 2), draws=2)
-    evaluator = Evaluator(session.config, session.env, session.learner, 16)
+    evaluator = Evaluator(session.config, session.env, session.agent, 16)
     scores = evaluator.run([policy], trial, (1, 2), seed=0)
     np.testing.assert_allclose(returns, scores[2].returns.ravel(), atol=5e-4)
     assert np.median(np.abs(scores[1].returns - scores[2].returns)) > 0.05  # episodes do differ

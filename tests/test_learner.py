@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from cmrl_jax.algorithms.cmrl.learner import make_learner, per_task
+from cmrl_jax.algorithms.cmrl.learner import Learner, per_task
 from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch, routing_health
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.config.schema import Config
@@ -86,7 +86,7 @@ def filled_ring(seed=0, reward=None, terminated=False, capacity=CAPACITY):
 
 
 def build(cfg):
-    learner = make_learner(cfg, GOALS, OBS, ACT)
+    learner = Learner(cfg, GOALS, OBS, ACT)
     return SimpleNamespace(
         learner=learner,
         state=jax.jit(learner.init)(jax.random.key(0)),
@@ -115,7 +115,7 @@ def ring():
 def routed():
     """A minibatch and well-spread parameters; soft critics, a plain actor (to compile faster)."""
     rng = np.random.default_rng(2)
-    learner = make_learner(tiny_config(model={"modular_actor": False}), GOALS, OBS, ACT)
+    learner = Learner(tiny_config(model={"modular_actor": False}), GOALS, OBS, ACT)
     shapes = jax.eval_shape(learner.init, jax.random.key(0))
 
     def normal(*shape):
@@ -212,7 +212,7 @@ def test_target_is_a_constant_to_critics_and_encoder(routed):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_update_keeps_the_structure_of_the_state(variant, ring):
     """Same tree, shapes, dtypes and weak types in and out, so that scanning never retraces."""
-    learner = make_learner(tiny_config(**VARIANTS[variant]), GOALS, OBS, ACT)
+    learner = Learner(tiny_config(**VARIANTS[variant]), GOALS, OBS, ACT)
     before = jax.eval_shape(learner.init, jax.random.key(0))
     after, metrics = jax.eval_shape(learner.update, before, ring, ring, jax.random.key(0))
     assert jax.tree.structure(before) == jax.tree.structure(after)
@@ -284,7 +284,7 @@ def bootstrapping():
     model = {"net": "mlp", "conditioning": "task_id", "norm": "none"}
     sac = {"gamma": 0.9, "alpha": "fixed", "alpha_init": 1e-6, "lr": 3e-3, "tau": 0.05,
            "reward_norm": "per_task", "batch": 16}  # fmt: skip
-    learner = make_learner(tiny_config(model=model, sac=sac), GOALS, OBS, ACT)
+    learner = Learner(tiny_config(model=model, sac=sac), GOALS, OBS, ACT)
 
     @jax.jit
     def train(ring):
@@ -397,4 +397,4 @@ def test_rows_are_averaged_per_task():
 
 def test_goal_table_must_fit_the_training_tasks():
     with pytest.raises(ValueError, match="expected \\(3 training tasks"):
-        make_learner(tiny_config(), GOALS[:2], OBS, ACT)
+        Learner(tiny_config(), GOALS[:2], OBS, ACT)

@@ -70,19 +70,19 @@ def adapted(session, policy, trial):
 def test_the_belief_is_of_the_environments_transitions_but_the_last(session, policy, adapted):
     agent, episodes, _, trial = adapted
     assert [len(episode) for episode in episodes] == [HORIZON, HORIZON]
-    inference, params = session.learner.inference, policy.params
+    inference, params = session.algorithm.parts.inference, policy.params
     kept = [step for episode in episodes for step in episode[:-1]]
     by_lane = lambda x: jnp.asarray(np.stack(x, 1), jnp.float32)
     obs, action, reward, next_obs = map(by_lane, zip(*kept, strict=True))
-    normalize = lambda x: session.learner.normalize_obs(params.obs_stats, x)
+    normalize = lambda x: session.algorithm.parts.normalize_obs(params.obs_stats, x)
     flag = jnp.zeros(reward.shape, bool)
     transitions = Transition(normalize(obs), action, reward, flag, flag, flag, normalize(next_obs))
     goal, ones = trial.texts[0, 0], jnp.ones(LANES)
     wanted = inference.posterior(
         params.encoder_params, transitions, jnp.ones(reward.shape), goal, ones
     )
-    found = inference.posterior_of_belief(params.encoder_params, agent.belief, goal, ones)
-    np.testing.assert_array_equal(agent.belief.sums.count, 2 * (HORIZON - 1))
+    found = inference.posterior_of_belief(params.encoder_params, agent.memory.belief, goal, ones)
+    np.testing.assert_array_equal(agent.memory.belief.sums.count, 2 * (HORIZON - 1))
     np.testing.assert_allclose(found.mean, wanted.mean, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(found.variance, wanted.variance, rtol=1e-4)
 
@@ -133,7 +133,7 @@ def test_without_a_dropped_transition_metaworld_agrees_with_the_native_backend(
     z = z if deterministic else "text"
     trial = replace(trial, z=z, draws=2, deterministic=deterministic)
     ks = (0,) if z == "posterior" else (0, 1)
-    evaluator = Evaluator(session.config, session.env, session.learner, lanes=16)
+    evaluator = Evaluator(session.config, session.env, session.agent, lanes=16)
     native = evaluator.run([policy.params], trial, ks, seed=3)
     for row in range(len(TASKS)):
         found = k_shot(session, policy, of_task(trial, row), ks, HORIZON, seed=3)
@@ -172,7 +172,7 @@ def test_a_policy_that_is_told_the_task(trial):
     session = Session(small_config(**config, **{"eval.k": "[0]", "eval.final_k": "[0]"}))
     policy = Policy(random_policy(session, 1), {}, {})
     trial = session.trial("heldout", LANES)
-    evaluator = Evaluator(session.config, session.env, session.learner, lanes=6)
+    evaluator = Evaluator(session.config, session.env, session.agent, lanes=6)
     native = evaluator.run([policy.params], trial, (0,), seed=3)[0]
     found = k_shot(session, policy, of_task(trial, 1), (0,), HORIZON, seed=3)[0]
     np.testing.assert_allclose(found.returns[0], native.returns[0, 1], rtol=1e-4, atol=1e-5)
@@ -202,7 +202,10 @@ class Watched(MetaWorldAgent):
 
     def count(self):
         """Transitions in the belief of each lane."""
-        return np.array(self.belief.sums.count)  # pyright: ignore[reportOptionalMemberAccess]
+        return np.array(self.memory.belief.sums.count)
+
+    def latents(self):
+        return np.array(self.memory.conditioning)
 
     def init(self):
         super().init()
@@ -214,12 +217,12 @@ class Watched(MetaWorldAgent):
 
     def adapt_action(self, observations):
         result = super().adapt_action(observations)
-        self.log.append(("adapt_action", self._zc.copy(), self.count()))
+        self.log.append(("adapt_action", self.latents(), self.count()))
         return result
 
     def eval_action(self, observations):
         result = super().eval_action(observations)
-        self.log.append(("eval_action", self._zc.copy(), self.count()))
+        self.log.append(("eval_action", self.latents(), self.count()))
         return result
 
 
@@ -227,7 +230,7 @@ def test_metaworlds_own_function_drives_the_agent_as_it_should(session, policy, 
     one = of_task(trial, 1)
     base = agent_of(session, policy, one, [np.array([0]), np.array([1])], HORIZON, seed=3)
     agent = Watched(
-        session.config, session.learner, policy.params,
+        session.config.env, session.agent, policy.params,
         base._texts, base._lane_ids, 1, np.zeros(3), HORIZON, seed=3,
     ).watch()  # fmt: skip
     envs = make_vector_env(one.tasks[0], one.placements[0], 1, HORIZON)

@@ -40,7 +40,7 @@ def trial(session):
 def test_returns_are_those_of_the_native_backend(session, policy, trial):
     """On every task, and where an episode's first observation came with the last of another."""
     trial = replace(trial, z="text")
-    evaluator = Evaluator(session.config, session.env, session.learner, lanes=8)
+    evaluator = Evaluator(session.config, session.env, session.agent, lanes=8)
     native = evaluator.run([policy.params], trial, (0, 1), seed=3)
     for row in range(len(TASKS)):
         found = k_shot(session, policy, of_task(trial, row), (0, 1), HORIZON, seed=3)

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from env_fixtures import LANE_GOALS, LANE_TASKS, LANES
 
-from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config
 from cmrl_jax.evaluation.session import Session
 from envs.parity.reference import ReferenceEnv, scripted_policy
 from envs.physics.native import NativePhysics, unpack
 from envs.sawyer import OBS_MODES, Ml4Env, State
-from envs.tasks import SCENE_ID, SPECS, TASKS
+from envs.tasks import TASKS
+from envs.tasks.specs import SCENE_ID, SPECS
 
 STEPS = 150
 
@@ -213,11 +213,9 @@ def test_two_training_iterations_are_finite_and_repeat():
     config = load_config("smoke.yaml")
     config = replace(config, env=replace(config.env, physics="native", horizon=20))
     session = Session(config)
-    iteration = make_train_iteration(
-        config, session.env, session.learner, session.train_goals, session.train_placements()
-    )
+    iteration = session.algorithm.make_iteration(session.train_placements())
     program = jax.jit(iteration)
-    init = jax.jit(lambda key: init_run(config, session.learner, key))
+    init = jax.jit(session.algorithm.init)
     runs = []
     for _ in range(2):
         state, _ = program(init(jax.random.key(config.seed)))

@@ -13,12 +13,13 @@ from cmrl_jax.cli import plot_flags, render_flags
 from cmrl_jax.cli.flags import Parser, parse
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config, to_yaml
-from cmrl_jax.config.schema import TASKS, ConfigError
+from cmrl_jax.config.schema import ConfigError
 from envs import goal_sets
 from envs.command_line import brief
 from envs.outputs import check_output, replacing, save_figure, write_json, written_by
 from envs.parity import __main__ as parity
 from envs.render import picture
+from envs.tasks import TASKS
 
 MARK = written_by("eval")
 

@@ -18,8 +18,8 @@ import pytest
 from run_helpers import ITERATIONS, ROOT, checkpoint_leaves, modular, rows_of, smoke, start
 
 from cmrl_jax import parallel
+from cmrl_jax.algorithms.cmrl.rules import Rules
 from cmrl_jax.config.files import load_config
-from cmrl_jax.config.rules import check_devices
 from cmrl_jax.config.schema import ConfigError
 
 DEVICES = 4
@@ -112,10 +112,10 @@ def test_one_device_has_no_mesh_and_no_other_program():
 def test_what_cannot_be_divided_is_refused(flags, devices, cause, cure):
     config = load_config("smoke.yaml", flags)
     if cause is None:
-        check_devices(config, devices)
+        Rules(config).check_devices(devices)
         return
     with pytest.raises(ConfigError) as raised:
-        check_devices(config, devices)
+        Rules(config).check_devices(devices)
     assert cause in raised.value.cause and cure in raised.value.cure
     assert "fewer devices" in raised.value.cure
 
@@ -125,7 +125,7 @@ def test_the_context_of_prior_lanes_alone_is_divided_too():
     collect = dataclasses.replace(config.collect, context_lanes="prior")
     config = dataclasses.replace(config, collect=dataclasses.replace(collect, context_episodes=1))
     with pytest.raises(ConfigError, match="context_episodes 1 cannot"):
-        check_devices(config, 4)
+        Rules(config).check_devices(4)
 
 
 def test_too_many_devices_are_two_lines_before_any_compile(tmp_path):

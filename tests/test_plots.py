@@ -12,7 +12,8 @@ from run_file_helpers import CSV, evaluation, write_run
 from cmrl_jax.analysis import plots
 from cmrl_jax.analysis.plots import Runs, band, read_metrics, series
 from cmrl_jax.cli.main import main
-from cmrl_jax.config.schema import TASKS, ConfigError
+from cmrl_jax.config.schema import ConfigError
+from envs.tasks import TASKS
 
 ROOT = Path(__file__).parent.parent
 # One panel is drawn faster than four.

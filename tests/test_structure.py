@@ -25,6 +25,7 @@ ROOMS = (
     "commands",
     "streams",
     "formats",
+    "registry",
     "config",
     "stop",
     "parallel",
@@ -46,8 +47,10 @@ ROOMS = (
 LIGHT = {
     "commands",
     "places",
+    "registry",
     "stop",
     "streams",
+    "algorithms.cmrl.rules",
     *(f"config.{name}" for name in ("schema", "rules", "files", "yaml_tree")),
     *(f"storage.{name}" for name in ("run_dir", "documents", "run_files", "run_groups", "locks")),
     "storage.output_files",
@@ -56,7 +59,7 @@ LIGHT = {
     *(f"cli.{name}" for name in ("main", "train", "stop_signal", "flags", "goals")),
     *(f"cli.{name}_flags" for name in ("evaluate", "render", "finetune", "plot")),
 }
-LIGHT_OF_ENVS = {"command_line", "goal_names", "outputs"}  # what those take from envs
+LIGHT_OF_ENVS = {"command_line", "goal_names", "outputs", "tasks"}  # what those take from envs
 # Light ones whose commands import the programs they run.
 COMMANDS = {"cli.main", "cli.train", "cli.evaluate_flags", "cli.goals"}
 

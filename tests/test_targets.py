@@ -151,7 +151,7 @@ def test_what_is_idle_changes_no_program():
 
     def program(config):
         session = Session(replace(config, tasks=small_config().tasks))
-        evaluator = Evaluator(config, session.env, session.learner, lanes=2)
+        evaluator = Evaluator(config, session.env, session.agent, lanes=2)
         traced = evaluator.traced(random_policy(session, 1), text_width=384)
         return re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr))
 

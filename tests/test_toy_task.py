@@ -14,7 +14,7 @@ import pytest
 
 from cmrl_jax.algorithms.cmrl import learner as learner_module
 from cmrl_jax.algorithms.cmrl import losses
-from cmrl_jax.algorithms.cmrl.learner import make_learner
+from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.config.schema import Config
 
@@ -77,7 +77,7 @@ def train_and_evaluate():
     and z from the prior.
     """
     cfg = toy_config()
-    learner = make_learner(cfg, jnp.zeros((TASKS, 1, 3)), obs_size=1, action_size=1)
+    learner = Learner(cfg, jnp.zeros((TASKS, 1, 3)), obs_size=1, action_size=1)
     inference = learner.inference
     assert inference is not None
 

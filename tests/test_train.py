@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 from run_helpers import ROOT, assert_same_result, native, rows_of, run_and_signal, smoke
 
-from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
+from cmrl_jax.algorithms.cmrl.rules import lane_groups
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config
-from cmrl_jax.config.schema import lane_groups
 from cmrl_jax.evaluation.session import Session, load_policy
 from cmrl_jax.storage.checkpoint import full_store
 from cmrl_jax.text import goal_files
@@ -202,9 +201,7 @@ def test_each_preset_runs_two_iterations_at_smoke_size(preset):
         train=dataclasses.replace(small.train, capacity=400),
     )
     session = Session(config)
-    iteration = make_train_iteration(
-        config, session.env, session.learner, session.train_goals, session.train_placements()
-    )
+    iteration = session.algorithm.make_iteration(session.train_placements())
     traces = []
 
     def counted(state):
@@ -212,7 +209,7 @@ def test_each_preset_runs_two_iterations_at_smoke_size(preset):
         return iteration(state)
 
     program = jax.jit(counted)
-    state = jax.jit(lambda key: init_run(config, session.learner, key))(jax.random.key(0))
+    state = jax.jit(session.algorithm.init)(jax.random.key(0))
     state, first = program(state)
     before = state.learner.actor_params
     state, second = program(state)

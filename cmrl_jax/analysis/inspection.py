@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmrl_jax.algorithms.cmrl.agent import PolicyParams, z_noise
+from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.common.rollout import rollout
 from cmrl_jax.analysis.inspection_file import Inspection, Latents, Usage, write_inspection
 from cmrl_jax.config.files import run_config
-from cmrl_jax.evaluation.episode import Lanes, PolicyParams, lane_noise, noise_key
+from cmrl_jax.evaluation.episode import Lanes, agent_keys
 from cmrl_jax.evaluation.evaluator import Evaluator, Trial
 from cmrl_jax.evaluation.options import EvalOptions
 from cmrl_jax.evaluation.session import Policy, Session, load_policy, prepare_jax
@@ -32,14 +34,15 @@ GOALS, DRAWS = 10, 3  # of a task, so 30 adaptation runs
 def inspect_run(run: Path) -> Path | None:
     """Inspects a run's newest policy checkpoint; returns the file written, `inspection.json`.
 
-    None for a policy with neither latent nor modules, which has nothing to show.
+    None for a policy with neither CMRL's latent nor its modules, which has nothing to show.
 
     Raises:
         ConfigError: no such checkpoint, it does not fit this program, or the directory refuses
             the file.
     """
-    model = run_config(run).model
-    if model.conditioning != "z" and not (model.net == "soft" and model.modular_actor):
+    own = run_config(run)
+    has_modules = own.model.net == "soft" and own.model.modular_actor
+    if own.algorithm != "cmrl" or not (own.model.conditioning == "z" or has_modules):
         return None
     config = evaluation_config(run, "native")
     prepare_jax(config)
@@ -51,30 +54,38 @@ def inspect_policy(
     run: Path, session: Session, policy: Policy, goals: int = GOALS, draws: int = DRAWS
 ) -> Inspection:
     """Inspects a policy on the first `goals` held-out goals of every task, `draws` runs each."""
-    config, inference, tasks = session.config, session.learner.inference, session.eval_tasks
+    config, tasks = session.config, session.eval_tasks
+    learner: Learner = session.algorithm.parts
+    inference = learner.inference
     k = 0 if inference is None else K
     options = EvalOptions(k=(k,), goals=goals, draws=draws, physics="native")
     trial = trial_of([policy], session, options, tasks)
-    evaluator = Evaluator(config, session.env, session.learner, len(tasks) * goals * draws)
+    evaluator = Evaluator(config, session.env, session.agent, len(tasks) * goals * draws)
     lanes = evaluator.lanes_of(trial)
     if inference is None:
-        latents, zc = None, session.learner.task_conditioning(lanes.train_row)
+        latents = None
+        zc = learner.task_conditioning(evaluator.told_of(trial).task_row[0])
     else:
-        latents = infer(session, policy.params, evaluator, trial, options.seed)
+        latents = infer(session, learner, policy.params, evaluator, trial, options.seed)
         zc = latents.z.reshape(-1, inference.latent_dim)
-    routing = mean_routing(session, policy.params, lanes, jnp.asarray(zc))
+    routing = mean_routing(session, learner, policy.params, lanes, jnp.asarray(zc))
     facts = {"k": k} | result_fields(run, policy.meta, options, config)
     return Inspection(tasks, usage_of(routing, len(tasks)), latents, facts)
 
 
 def infer(
-    session: Session, params: PolicyParams, evaluator: Evaluator, trial: Trial, seed: int
+    session: Session,
+    learner: Learner,
+    params: PolicyParams,
+    evaluator: Evaluator,
+    trial: Trial,
+    seed: int,
 ) -> Latents:
     """Posteriors of all lanes before any episode and after `K`, and the z's of the one after."""
-    inference = session.learner.inference
+    inference = learner.inference
     assert inference is not None  # the caller has looked
-    beliefs = [before for before, _ in evaluator.episodes([params], trial, K + 1, seed)]
-    texts, lane_id = evaluator.texts_of(trial)[0], evaluator.lanes_of(trial).lane_id
+    memories = [before for before, _ in evaluator.episodes([params], trial, K + 1, seed)]
+    texts, lane_id = evaluator.told_of(trial).text[0], evaluator.lanes_of(trial).lane_id
 
     @jax.jit
     def posterior_of(belief):
@@ -85,8 +96,8 @@ def infer(
     @jax.jit
     def draw(posterior):
         key = jax.random.fold_in(jax.random.key(seed), K)
-        keys = jax.vmap(noise_key, in_axes=(None, 0))(key, lane_id)
-        return inference.z_of_noise(posterior, lane_noise(keys, inference.latent_dim))
+        noise = z_noise(agent_keys(key, lane_id), inference.latent_dim)
+        return inference.z_of_noise(posterior, noise)
 
     def by_task(x: jax.Array) -> np.ndarray:
         return np.asarray(x).reshape(len(trial.tasks), -1, *x.shape[1:])
@@ -96,7 +107,7 @@ def infer(
             return None
         return by_task(jnp.sum(kl_to_standard_normal(posterior), -1)).mean(1)
 
-    own, text = posterior_of(beliefs[K]), posterior_of(beliefs[0])
+    own, text = posterior_of(memories[K].belief), posterior_of(memories[0].belief)
     reads_text = inference.has_goal_factor
     return Latents(
         mean=by_task(own.mean),
@@ -108,7 +119,7 @@ def infer(
 
 
 def mean_routing(
-    session: Session, params: PolicyParams, lanes: Lanes, zc: jax.Array
+    session: Session, learner: Learner, params: PolicyParams, lanes: Lanes, zc: jax.Array
 ) -> Routing | None:
     """The actor's routing in an episode of every lane, mean over its steps, (lane, ...).
 
@@ -118,15 +129,14 @@ def mean_routing(
     Returns:
         None for an actor without modules.
     """
-    env, learner, horizon = session.env, session.learner, session.config.env.horizon
+    env, horizon = session.env, session.config.env.horizon
 
     @jax.jit
     def play(params: PolicyParams, lanes: Lanes, zc: jax.Array):
         policy, key = (params.actor_params, params.obs_stats), jax.random.key(0)  # draws nothing
-        state = jax.vmap(env.reset_to)(lanes.env_task, lanes.placement)
-        _, episode, _ = rollout(
-            env, learner, policy, state, zc, key, horizon, horizon, deterministic=True
-        )
+        act = lambda obs, key, noise: learner.policy(*policy, obs, zc, key, True)[0]
+        state = jax.vmap(env.reset_to)(lanes.env_task, lanes.goal)
+        _, episode, _ = rollout(env, act, state, key, horizon, horizon)
         routing_at = lambda obs: learner.policy(*policy, obs, zc, key, True)[1]
         routing = jax.vmap(routing_at)(episode.obs)  # (time, lane, ...)
         return jax.tree.map(lambda x: x.mean(0), routing)

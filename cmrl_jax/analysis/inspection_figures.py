@@ -15,7 +15,7 @@ import numpy as np
 
 from cmrl_jax.analysis.inspection_file import Inspection, Latents
 from cmrl_jax.analysis.pca import principal_axes
-from cmrl_jax.config.schema import TASKS
+from cmrl_jax.registry import task_names
 from envs.outputs import save_figure
 
 COLLAPSED = 0.1  # nats; below it on every task z is called N(0, I)
@@ -165,7 +165,7 @@ def _latent_panel(axis: Any, inspection: Inspection) -> None:
     centre, axes, shares = principal_axes(latents.z.reshape(-1, latents.z.shape[-1]))
     project = lambda x: ((x - centre) @ axes.T).T
     for row, task in enumerate(inspection.tasks):
-        color, label = f"C{TASKS.index(task)}", _row_name(inspection, task)
+        color, label = f"C{task_names().index(task)}", _row_name(inspection, task)
         if latents.kl is not None:
             label += f": {latents.kl[row]:.2f}"
         if latents.text_kl is not None:

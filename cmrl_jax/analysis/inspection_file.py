@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from cmrl_jax.config.schema import TASKS, ConfigError
+from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.registry import task_names
 from cmrl_jax.storage.documents import is_there, read_json
 from cmrl_jax.storage.run_dir import cannot_write, write_text
 
@@ -127,7 +128,7 @@ def read_inspection(run: Path) -> Inspection | None:
 def _check(found: Inspection) -> None:
     """Raises ValueError, TypeError or KeyError where a figure could not be drawn."""
     tasks = found.tasks
-    if not tasks or len(set(tasks)) < len(tasks) or not set(tasks) <= set(TASKS):
+    if not tasks or len(set(tasks)) < len(tasks) or not set(tasks) <= set(task_names()):
         raise ValueError(f"tasks are {tasks}")
     for name in ("env_steps", "k", "goals", "draws"):
         if type(found.facts[name]) is not int:

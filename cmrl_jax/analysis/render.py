@@ -87,7 +87,7 @@ def film_run(
     """
     env = FilmedEnv(session.config.env.goal_observable, session.config.env.obs_mode)
     tasks = session.eval_tasks
-    evaluator = Evaluator(session.config, env, session.learner, len(tasks), horizon)
+    evaluator = Evaluator(session.config, env, session.agent, len(tasks), horizon)
     options = EvalOptions(goals=goal + 1, goal_set=goal_set)
     trial = trial_of([policy], session, options, tasks).of_goal(goal)
     scores = evaluator.run([policy.params], trial, range(k + 1), seed)

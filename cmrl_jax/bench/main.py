@@ -20,7 +20,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cmrl_jax.algorithms.cmrl.collect import init_run
 from cmrl_jax.algorithms.common.replay import Transition, add
 from cmrl_jax.bench import physics as bench_physics
 from cmrl_jax.bench import stages as bench_stages
@@ -32,7 +31,6 @@ from cmrl_jax.evaluation.session import Session, prepare_jax
 from cmrl_jax.places import ROOT
 from cmrl_jax.storage.versions import package_versions
 from envs.outputs import write_json
-from envs.sawyer import ACTION_SIZE, OBS_SIZE
 
 CONFIG = "ml4.yaml"
 LANES = (32, 256, 512, 2048)
@@ -61,19 +59,20 @@ class Report:
 
 def bench_learner(config: Config, report: Report) -> None:
     """Gradient steps a second on rings full of random transitions."""
-    learner = Session(config).learner
-    run = jax.jit(lambda key: init_run(config, learner, key))(jax.random.key(0))
+    session = Session(config)
+    learner, env = session.algorithm.parts, session.env
+    run = jax.jit(session.algorithm.init)(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), 4)
     lead = (config.env.horizon, len(config.tasks.train), run.replay.lanes_per_task)
     flag = jnp.zeros(lead, bool)
     data = Transition(
-        obs=jax.random.normal(keys[0], (*lead, OBS_SIZE)),
-        action=jax.random.uniform(keys[1], (*lead, ACTION_SIZE), minval=-1, maxval=1),
+        obs=jax.random.normal(keys[0], (*lead, env.observation_size)),
+        action=jax.random.uniform(keys[1], (*lead, env.action_size), minval=-1, maxval=1),
         reward=jax.random.uniform(keys[2], lead),
         terminated=flag,
         truncated=flag,
         first=flag,
-        next_obs=jax.random.normal(keys[3], (*lead, OBS_SIZE)),
+        next_obs=jax.random.normal(keys[3], (*lead, env.observation_size)),
     )
     replay = jax.jit(add)(run.replay, data)
     writers = run.context.lanes_per_task

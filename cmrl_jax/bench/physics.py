@@ -20,7 +20,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from envs.engine import mujoco
 from envs.physics.model import load_scene
-from envs.sawyer import ACTION_SIZE, Ml4Env
+from envs.sawyer import Ml4Env
 from envs.tasks import TASKS
 
 CONTROL_STEPS, REPEATS, SUBSTEPS = 20, 3, 5
@@ -51,7 +51,9 @@ def bench_backend(physics: str, lane_counts: tuple[int, ...], report: Report) ->
 
     def steps(state, key):
         def step(state, key):
-            action = jax.random.uniform(key, (len(state.steps), ACTION_SIZE), minval=-1, maxval=1)
+            action = jax.random.uniform(
+                key, (len(state.steps), env.action_size), minval=-1, maxval=1
+            )
             return jax.vmap(env.step)(state, action), None
 
         return jax.lax.scan(step, state, jax.random.split(key, CONTROL_STEPS))[0]

@@ -23,7 +23,8 @@ from envs.physics.mjx.backend import (
 from envs.physics.mjx.quiet import mjx
 from envs.physics.mjx.solver import solve
 from envs.physics.model import JOINTS
-from envs.tasks import SCENE_ID, TASKS
+from envs.tasks import TASKS
+from envs.tasks.specs import SCENE_ID
 
 
 def bench_stages(lane_counts: tuple[int, ...], report: Report) -> None:

@@ -62,7 +62,7 @@ def time_one_by_one(
         for target in targets
         for task in target.tasks
     }
-    evaluator = Evaluator(session.config, session.env, session.learner, 1, options.horizon)
+    evaluator = Evaluator(session.config, session.env, session.agent, 1, options.horizon)
     started = time.monotonic()
     evaluator.compile(policies[targets[0]].params, next(iter(trials.values())).texts.shape[-1])
     compiled, worked = time.monotonic(), time.process_time()

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from cmrl_jax.algorithms.cmrl.collect import init_run
 from cmrl_jax.algorithms.cmrl.learner import TrainState
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import Config, call_envs
@@ -83,8 +82,7 @@ def finetune_run(
 
 def load_learner(run: Path, config: Config, session: Session) -> tuple[TrainState, dict[str, Any]]:
     """The learner's state of a run's newest full checkpoint, and the checkpoint's record."""
-    init = lambda key: init_run(config, session.learner, key)
-    abstract = jax.eval_shape(init, jax.random.key(0))
+    abstract = jax.eval_shape(session.algorithm.init, jax.random.key(0))
     with full_store(run, read_only=True) as store:
         trees, meta = store.restore(split_run(abstract), config, versions=package_versions())
     return join_run(abstract, trees).learner, meta

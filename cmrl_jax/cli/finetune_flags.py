@@ -6,8 +6,9 @@ import argparse
 
 from cmrl_jax.cli.flags import add_force, goal_count, names, seed
 from cmrl_jax.config.rules import check_goal_set
-from cmrl_jax.config.schema import MOST_EPISODES, MOST_UPDATES, TASKS, ConfigError, suggest
+from cmrl_jax.config.schema import MOST_EPISODES, MOST_UPDATES, ConfigError, suggest
 from cmrl_jax.evaluation.finetune_options import ADAPT, FinetuneOptions
+from cmrl_jax.registry import task_names
 from envs.command_line import typed_path, whole
 from envs.goal_names import GOALS
 
@@ -42,8 +43,8 @@ def options_of(args: argparse.Namespace) -> FinetuneOptions:
     Raises:
         ConfigError: a flag that cannot be.
     """
-    if args.task not in TASKS:
-        cure = f"{suggest(args.task, TASKS)}tasks: {', '.join(TASKS)}"
+    if args.task not in task_names():
+        cure = f"{suggest(args.task, task_names())}tasks: {', '.join(task_names())}"
         raise ConfigError(f"unknown task '{args.task}'", cure)
     for word in args.adapt or ("",):
         if word not in ADAPT:

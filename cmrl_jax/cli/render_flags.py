@@ -8,8 +8,9 @@ from typing import Any
 
 from cmrl_jax.cli.flags import add_force, episodes, goal_index, natural, seed, steps
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.rules import check_goal_set
+from cmrl_jax.config.rules import check_goal_set, require
 from cmrl_jax.config.schema import ConfigError, call_envs
+from cmrl_jax.registry import rules_of
 from cmrl_jax.storage.output_files import writable
 from cmrl_jax.storage.run_dir import find_run
 from envs.command_line import make_directory, typed_path, whole
@@ -48,9 +49,11 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     check_goal_set(args.goal_set, "--goal-set")
     run = find_run(args.run)
     config = run_config(run)
-    has_latent = config.model.conditioning == "z"
-    if args.k and not has_latent:
-        cause = f"--k {args.k} with model.conditioning {config.model.conditioning}"
+    cause = f"render with env.name {config.env.name}"
+    require(config.env.name == "ml4", cause, "give a run of ml4: films show Meta-World's scenes")
+    rules = call_envs(lambda: rules_of(config))
+    if args.k and not rules.adapts:
+        cause = f"--k {args.k} with {rules.kind}"
         raise ConfigError(cause, "give --k 0: only a latent z can adapt")
     for module, package in _PACKAGES.items():
         if importlib.util.find_spec(module) is None:
@@ -63,7 +66,7 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
             writable(out / f"{task}.{ending}", "--out", written_by("render"), args.force)
     return {
         "run": run,
-        "k": args.k if args.k is not None else int(has_latent),
+        "k": args.k if args.k is not None else int(rules.adapts),
         "goal": args.goal,
         "goal_set": args.goal_set,
         "seed": args.seed,

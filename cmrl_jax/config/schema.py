@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
 from envs.goal_names import GOALS, LARGEST_SEED
 
-TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 TEXT_ENCODERS = ("minilm-l6-v2", "clip-vit-b-32")  # the table of the first is packaged
 GOAL_ABLATIONS = ("one-hot", "zero", "shuffled")
 # Beyond these, what is counted in 32 bits (steps of an episode, episodes by which draws are named,
@@ -69,12 +67,15 @@ def doc(
 
 @dataclass(frozen=True)
 class TasksConfig:
-    train: tuple[str, ...] = doc(TASKS[:3], "tasks that are trained on")
-    test: tuple[str, ...] = doc(TASKS[3:], "held-out tasks: evaluated, never trained on")
+    train: tuple[str, ...] = doc(
+        ("drawer-open", "drawer-close", "window-open"), "tasks that are trained on"
+    )
+    test: tuple[str, ...] = doc(("window-close",), "held-out tasks: evaluated, never trained on")
 
 
 @dataclass(frozen=True)
 class EnvConfig:
+    name: str = doc("ml4", "registered environment; all but horizon below is ml4's")
     physics: Literal["mjx", "native"] = doc(
         "mjx", "mjx: on the device; native: MuJoCo C on the host, Meta-World's own contacts"
     )
@@ -261,6 +262,9 @@ class RuntimeConfig:
 class Config:
     name: str = doc("cmrl", "name of the preset, recorded with the run")
     seed: int = doc(0, "seed of the whole run", high=LARGEST_SEED)
+    algorithm: str = doc(
+        "cmrl", "registered algorithm; model, encoder, kl, sac and collect are cmrl's"
+    )
     tasks: TasksConfig = TasksConfig()
     env: EnvConfig = EnvConfig()
     goals: GoalsConfig = GoalsConfig()
@@ -289,23 +293,6 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Field, Any]]:
 def lanes_per_task(config: Config) -> int:
     """Parallel environments of each training task."""
     return config.collect.lanes // len(config.tasks.train)
-
-
-def lane_groups(config: Config) -> tuple[int, int, int]:
-    """Lanes of one task whose z comes from prior, text and posterior; without z, all are prior.
-
-    Largest remainders: the counts sum to the lanes of a task and differ from the shares by less
-    than one lane.
-    """
-    lanes = lanes_per_task(config)
-    if config.model.conditioning != "z":
-        return lanes, 0, 0
-    exact = [share * lanes for share in config.collect.group_frac]
-    counts = [math.floor(x + 1e-9) for x in exact]
-    by_remainder = sorted(range(3), key=lambda i: counts[i] - exact[i])
-    for i in by_remainder[: lanes - sum(counts)]:
-        counts[i] += 1
-    return counts[0], counts[1], counts[2]
 
 
 def suggest(word: str, valid: tuple[str, ...] | list[str]) -> str:

@@ -1,8 +1,8 @@
 """Controls of an evaluation: whose belief a lane's z is drawn from, and whose sentence it is given.
 
 They answer "is z used, is the text?": a policy whose score survives another lane's z does not use
-z. Both are defined on the tasks' own order (`envs.tasks.TASKS`), so that neither depends on the
-order in which tasks are evaluated.
+z. Neither depends on the order in which tasks are evaluated: whose sentence a lane is given is the
+registry's matter (`registry.other_task`), whose belief goes by the tasks' ids.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-
-from cmrl_jax.config.schema import TASKS
 
 _SHUFFLE_SEED = 0  # one derangement for everybody, so that runs are compared lane by lane
 
@@ -34,11 +32,6 @@ def donors(z: str, lane_id: np.ndarray, env_task: np.ndarray) -> np.ndarray:
         by_lane = np.lexsort((lane_id, env_task)).reshape(len(np.unique(env_task)), -1)
         own[by_lane] = np.roll(by_lane, -1, axis=0)
     return own
-
-
-def other_task(task: str) -> str:
-    """The task whose sentence `--text-control shuffled` gives in place of this one's."""
-    return TASKS[(TASKS.index(task) + 1) % len(TASKS)]
 
 
 def text_per_goal(vectors: Sequence[np.ndarray], goals: int) -> np.ndarray:

@@ -1,10 +1,10 @@
 """The meta-test protocol: success after k adaptation episodes, trained on by nothing.
 
-One adaptation run is a fixed goal and a belief that starts empty. Episode e acts with z drawn from
-the posterior over all own transitions of episodes 0..e-1 (the first: from the text, or from the
-prior without a goal factor), deterministically apart from that draw. So the score at k is the score
-of episode k, and one run of max(k) + 1 episodes gives the whole curve (oyster evaluates the same
-way: katerakelly/oyster: rlkit/core/rl_algorithm.py).
+One adaptation run is a fixed goal and an agent's memory that starts empty. Episode e is acted on
+what episodes 0..e-1 have shown (CMRL: z from the posterior over all own transitions; the first from
+the text, or from the prior without a goal factor), deterministically apart from the agent's own
+draw. So the score at k is the score of episode k, and one run of max(k) + 1 episodes gives the
+whole curve (oyster evaluates the same way: katerakelly/oyster: rlkit/core/rl_algorithm.py).
 
 Lanes are task x goal x draw of each policy, in batches of a fixed number of lanes, so that every
 evaluation of a process runs one compiled program, controls included.
@@ -19,15 +19,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.algorithms.base import Agent, Told
 from cmrl_jax.config.schema import Config
 from cmrl_jax.evaluation.controls import donors
-from cmrl_jax.evaluation.episode import Episode, Lanes, PolicyParams, ZSource, make_episode
-from cmrl_jax.nn.context import init_belief
-from envs.sawyer import Ml4Env
-from envs.tasks import TASKS, task_id
+from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
+from cmrl_jax.evaluation.options import MOST_DRAWS
+from envs.base import MetaEnv
 
 GOAL_IDS = 1000  # more than the goals of any set
+TASK_IDS = 4  # tasks whose lanes are numbered side by side
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Trial:
 
     Attributes:
         tasks: task names.
-        placements: goals (task, goal, 3), fixture placements in metres.
+        placements: goals (task, goal, goal_size).
         texts: text vector that a lane is given (policy, task, goal, G).
         first_goal: number of the first goal, by which its lanes' noise is named.
         draws: z draws a goal.
@@ -74,37 +74,37 @@ class Evaluator:
     def __init__(
         self,
         config: Config,
-        env: Ml4Env,
-        learner: Learner,
+        env: MetaEnv,
+        agent: Agent,
         lanes: int,
         horizon: int | None = None,
         policies: int = 1,
     ):
         self.lanes, self.policies = lanes, policies
         self.horizon = horizon or config.env.horizon
-        self._train_tasks = config.tasks.train
-        self._inference = learner.inference
-        self._episode = jax.jit(make_episode(config, env, learner, self.horizon))
+        self._train_tasks, self._env, self._agent = config.tasks.train, env, agent
+        self._episode = jax.jit(make_episode(env, agent, self.horizon))
         self._compiled: Any = None
 
     @property
     def is_compiled(self) -> bool:
         return self._compiled is not None
 
-    def compile(self, params: PolicyParams, text_width: int) -> None:
+    def compile(self, params: Any, text_width: int) -> None:
         """Compiles the episode for one policy's parameter shapes; later calls do not compile."""
         if self._compiled is None:
             self._compiled = self.traced(params, text_width).lower().compile()
 
-    def traced(self, params: PolicyParams, text_width: int) -> Any:
+    def traced(self, params: Any, text_width: int) -> Any:
         """The episode as jax traces it for one policy's parameter shapes."""
-        shape = (self.policies, self.lanes)
-        text, zero = np.zeros((*shape, text_width), np.float32), np.zeros(self.lanes, np.int32)
-        lanes = Lanes(zero, zero, zero, np.zeros((self.lanes, 3), np.float32))
-        source = ZSource(self._empty(self.lanes), text, np.zeros(shape, np.float32))
+        shape, zero = (self.policies, self.lanes), np.zeros(self.lanes, np.int32)
+        text, ones = np.zeros((*shape, text_width), np.float32), np.ones(shape, np.float32)
+        memory = self._blank(Told(text, ones, np.zeros(shape, np.int32)))
+        lanes = Lanes(zero, zero, np.zeros((self.lanes, self._env.goal_size), np.float32))
         stacked = _stack([params] * self.policies)
-        args = (stacked, source.belief, text, source, lanes, np.bool_(True), jax.random.key(0))
-        return self._episode.trace(*args)
+        return self._episode.trace(
+            stacked, memory, memory, lanes, np.bool_(True), jax.random.key(0)
+        )
 
     def memory_bytes(self) -> int:
         """Memory that the compiled episode needs beside its arguments, in bytes; 0: unknown."""
@@ -113,7 +113,7 @@ class Evaluator:
 
     def run(
         self,
-        policies: Sequence[PolicyParams],
+        policies: Sequence[Any],
         trial: Trial,
         k: Sequence[int],
         seed: int,
@@ -133,7 +133,7 @@ class Evaluator:
 
     def episodes(
         self,
-        policies: Sequence[PolicyParams],
+        policies: Sequence[Any],
         trial: Trial,
         count: int,
         seed: int,
@@ -147,74 +147,88 @@ class Evaluator:
             check: is called before each batch; what it raises ends the evaluation.
 
         Yields:
-            For each episode the beliefs of all lanes before it, numpy (policy, lane, ...) or None
-            without a latent, and its Episode of numpy arrays (policy, task, goal, draw).
+            For each episode the memories of all lanes before it, numpy (policy, lane, ...), and
+            its Episode of numpy arrays (policy, task, goal, draw).
         """
         self.compile(policies[0], trial.texts.shape[-1])
         params = _stack([*policies, *[policies[-1]] * (self.policies - len(policies))])
         shape = (len(policies), *trial.placements.shape[:2], trial.draws)
-        lanes, texts = self.lanes_of(trial), self.texts_of(trial)
+        lanes, told = self.lanes_of(trial), self.told_of(trial)
         total = len(lanes.lane_id)
-        donor = donors(trial.z, lanes.lane_id, lanes.env_task)
-        uses_belief = trial.z not in ("prior", "text")
-        text_mask = np.full((self.policies, self.lanes), trial.z != "prior", np.float32)
-        key, beliefs = jax.random.key(seed), self._empty(total)
+        memories, source_of = self._blank(told), self._sources(trial, lanes, told)
+        key = jax.random.key(seed)
         for episode in range(count):
-            # Every batch draws from what was known before the episode, its donors' lanes too.
-            before = jax.tree.map(np.copy, beliefs)
+            # Every batch acts on what was known before the episode, its donors' lanes too.
+            before = jax.tree.map(np.copy, memories)
             parts = []
             for start in range(0, total, self.lanes):
                 check()
                 index = np.minimum(np.arange(start, start + self.lanes), total - 1)
-                giver = donor[index]
-                belief = jax.tree.map(lambda x: x[:, giver], before) if uses_belief else None
-                belief, part = self._compiled(
+                memory, part = self._compiled(
                     params,
                     jax.tree.map(lambda x: x[:, index], before),
-                    texts[:, index],
-                    ZSource(belief or self._empty(self.lanes), texts[:, giver], text_mask),
+                    source_of(before, index),
                     Lanes(*(x[index] for x in lanes)),
                     np.bool_(trial.deterministic),
                     jax.random.fold_in(key, episode),
                 )
                 valid = min(self.lanes, total - start)
-                for all_lanes, new in zip(*map(jax.tree.leaves, (beliefs, belief)), strict=True):
-                    all_lanes[:, start : start + valid] = np.asarray(new)[:, :valid]
+                for every, new in zip(*map(jax.tree.leaves, (memories, memory)), strict=True):
+                    every[:, start : start + valid] = np.asarray(new)[:, :valid]
                 parts.append(jax.tree.map(np.asarray, part))
             joined = jax.tree.map(lambda *x: np.concatenate(x, 1)[:, :total], *parts)
             known = jax.tree.map(lambda x: x[: shape[0]], before)
             yield known, jax.tree.map(lambda x: x[: shape[0]].reshape(shape), joined)
 
-    def _empty(self, lanes: int) -> Any:
-        """Empty beliefs of all policies, numpy (policy, lane, ...); None without a latent."""
-        if self._inference is None:
-            return None
-        belief = init_belief((self.policies, lanes), self._inference.latent_dim)
-        return jax.tree.map(np.array, belief)
+    def _sources(self, trial: Trial, lanes: Lanes, told: Told) -> Callable[[Any, Any], Any]:
+        """What lanes act on, by the trial's control: (memories, index of lanes) -> memories."""
+        if trial.z == "text":
+            told_alone = self._blank(told)
+            return lambda _, index: jax.tree.map(lambda x: x[:, index], told_alone)
+        if trial.z == "prior":
+            nothing = self._blank(told._replace(text_mask=np.zeros_like(told.text_mask)))
+            return lambda _, index: jax.tree.map(lambda x: x[:, index], nothing)
+        donor = donors(trial.z, lanes.lane_id, lanes.env_task)
+        return lambda memories, index: jax.tree.map(lambda x: x[:, donor[index]], memories)
+
+    def _blank(self, told: Told) -> Any:
+        """Memories of lanes that have seen nothing, numpy (policy, lane, ...)."""
+        return jax.tree.map(np.array, self._agent.init(told))
 
     def lanes_of(self, trial: Trial) -> Lanes:
         """All lanes of a trial, in the order task, goal, draw."""
         task, goal, _ = _indices(trial)
-        train = self._train_tasks
-        rows = [train.index(name) if name in train else 0 for name in trial.tasks]
         return Lanes(
-            env_task=_task_ids(trial)[task],
-            train_row=np.array(rows, np.int32)[task],
-            lane_id=lane_names(trial),
-            placement=np.asarray(trial.placements, np.float32)[task, goal],
+            env_task=self._task_ids(trial)[task],
+            lane_id=lane_names(trial, self._env.tasks),
+            goal=np.asarray(trial.placements, np.float32)[task, goal],
         )
 
-    def texts_of(self, trial: Trial) -> np.ndarray:
-        """The text of every lane (policy, lane, G), for all places of the evaluator."""
+    def told_of(self, trial: Trial) -> Told:
+        """What every lane is told (policy, lane, ...), for all places of the evaluator."""
         texts = np.repeat(np.asarray(trial.texts, np.float32), trial.draws, axis=2)
         texts = texts.reshape(len(texts), -1, texts.shape[-1])
-        return texts[np.minimum(np.arange(self.policies), len(texts) - 1)]
+        texts = texts[np.minimum(np.arange(self.policies), len(texts) - 1)]
+        train = self._train_tasks
+        rows = [train.index(name) if name in train else 0 for name in trial.tasks]
+        row = np.array(rows, np.int32)[_indices(trial)[0]]
+        shape = texts.shape[:2]
+        return Told(texts, np.ones(shape, np.float32), np.broadcast_to(row, shape))
+
+    def _task_ids(self, trial: Trial) -> np.ndarray:
+        return np.array([self._env.tasks.index(name) for name in trial.tasks], np.int32)
 
 
-def lane_names(trial: Trial) -> np.ndarray:
-    """What a lane's noise depends on: a number for each (task, goal, draw), int32 (lane,)."""
+def lane_names(trial: Trial, tasks: Sequence[str]) -> np.ndarray:
+    """What a lane's noise depends on: a number for each (task, goal, draw), int32 (lane,).
+
+    Args:
+        tasks: the environment's. A name depends on a task's place alone, not on how many follow.
+    """
     task, goal, draw = _indices(trial)
-    name = draw * np.int32(len(TASKS)) + _task_ids(trial)[task]
+    place = np.array([tasks.index(name) for name in trial.tasks], np.int32)[task]
+    block, within = place // TASK_IDS, place % TASK_IDS
+    name = (block * np.int32(MOST_DRAWS) + draw) * np.int32(TASK_IDS) + within
     return name * np.int32(GOAL_IDS) + (goal + np.int32(trial.first_goal))
 
 
@@ -224,10 +238,6 @@ def _indices(trial: Trial) -> np.ndarray:
     return np.indices(shape, np.int32).reshape(3, -1)
 
 
-def _task_ids(trial: Trial) -> np.ndarray:
-    return np.array([task_id(name) for name in trial.tasks], np.int32)
-
-
-def _stack(policies: Sequence[PolicyParams]) -> PolicyParams:
+def _stack(policies: Sequence[Any]) -> Any:
     """Policies with a leading policy axis, on the host: nothing to compile."""
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *policies)

@@ -19,20 +19,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.algorithms.cmrl.collect import init_run, make_train_iteration
-from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState, make_learner
+from cmrl_jax.algorithms.base import Told
+from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, policy_params
+from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
+from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
 from cmrl_jax.algorithms.common.replay import ReplayState, stored_transitions
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config
-from cmrl_jax.evaluation.episode import Episode, Lanes, PolicyParams, ZSource, make_episode
+from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
 from cmrl_jax.evaluation.finetune_options import FinetuneOptions
 from cmrl_jax.nn import normalizers
 from cmrl_jax.nn.context import Belief, ContextInference, init_belief, make_context_inference
 from cmrl_jax.nn.distributions import Gaussian
 from cmrl_jax.nn.optimizers import init_adam
-from envs.sawyer import Ml4Env
-from envs.tasks import task_id
+from cmrl_jax.registry import make_environment
 
 ROUTER_PARTS = ("embedding", "gating", "routing")  # names in networks.SoftModularNet begin so
 FREE_LATENT = "z"
@@ -151,13 +152,21 @@ def is_adapted(adapt: str, network: str, path: tuple[Any, ...]) -> bool:
     return False  # posterior
 
 
-def restrict(learner: Learner, adapt: str) -> Learner:
-    """The learner with gradient steps that change only what `adapt` allows."""
+class RestrictedLearner(Learner):
+    """A learner whose gradient steps change only what `adapt` allows; other arguments as its."""
 
-    def update(state: TrainState, replay_state: Any, context_state: Any, key: jax.Array):
+    def __init__(self, adapt: str, *args: Any, **options: Any):
+        super().__init__(*args, **options)
+        self.adapt = adapt
+
+    def update(
+        self, state: TrainState, replay_state: Any, context_state: Any, key: jax.Array
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        """One gradient step; what it must not change is put back."""
+        adapt = self.adapt
         if adapt == "posterior":
             return state, {}
-        new, metrics = learner.update(state, replay_state, context_state, key)
+        new, metrics = super().update(state, replay_state, context_state, key)
         kept = {
             name: jax.tree_util.tree_map_with_path(
                 lambda path, new, old, name=name: new if is_adapted(adapt, name, path) else old,
@@ -167,8 +176,6 @@ def restrict(learner: Learner, adapt: str) -> Learner:
             for name in _NETWORKS
         }
         return replace(new, **kept), metrics
-
-    return replace(learner, update=update)
 
 
 def start_state(
@@ -224,17 +231,18 @@ class FineTuning:
         options: FinetuneOptions,
     ):
         self.config = config
-        env_config = self.config.env
-        physics = options.physics or env_config.physics
-        self.env = Ml4Env(env_config.goal_observable, physics, env_config.obs_mode)
+        physics = options.physics or self.config.env.physics
+        self.env = make_environment(replace(self.config.env, physics=physics))
         goals = jnp.asarray(text)[None, None]  # (task, paraphrase, G)
         inference = None
         if adapt == "z":
             inference = free_latent(self.config.encoder.latent_dim)
-        learner = make_learner(self.config, goals, inference=inference)
-        self.learner = restrict(learner, adapt)
+        sizes = self.env.observation_size, self.env.action_size
+        self.learner = RestrictedLearner(adapt, self.config, goals, *sizes, inference=inference)
+        learner = self.learner
+        self.agent = CmrlAgent(learner, self.config.collect.chunk)
         self.text, self.task = text, options.task
-        iteration = make_train_iteration(
+        iteration = TrainIteration(
             self.config,
             self.env,
             self.learner,
@@ -244,11 +252,9 @@ class FineTuning:
             learn_at_once=True,
         )
         self.iteration = jax.jit(iteration, donate_argnums=0)
-        self.episode = jax.jit(
-            make_episode(self.config, self.env, self.learner, self.config.env.horizon)
-        )
+        self.episode = jax.jit(make_episode(self.env, self.agent, self.config.env.horizon))
         # As programs: op by op, each of their hundreds of shapes would be compiled by itself.
-        init = jax.jit(lambda key: init_run(self.config, learner, key))
+        init = jax.jit(lambda key: init_run(self.config, self.env, learner, key))
         start = jax.jit(
             lambda fresh, trained, text: start_state(
                 adapt, self.config, learner, fresh, trained, text
@@ -270,23 +276,18 @@ class FineTuning:
         """Success on goals (goal, 3), with the belief over all own transitions."""
         goals, state = len(placements), self.run.learner
         texts = np.broadcast_to(self.text, (1, goals, len(self.text)))
-        row = np.zeros(goals, np.int32)
-        belief = None
+        row, task = np.zeros(goals, np.int32), self.env.tasks.index(self.task)
+        told = Told(texts, np.ones((1, goals), np.float32), row[None])
+        memory = self.agent.init(told)
         if self.learner.inference is not None:
             own = self.own_belief(state, self.run.context, jnp.asarray(self.text))
             belief = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, goals, *x.shape[1:])), own)
-        first = lambda tree: jax.tree.map(lambda x: x[None], tree)  # one policy
-        params = PolicyParams(
-            actor_params=first(state.actor_params),
-            encoder_params=first(state.encoder_params),
-            obs_stats=first(state.obs_stats),
-        )
+            memory = replace(memory, belief=belief)
         _, scores = self.episode(
-            params,
-            belief,
-            texts,
-            ZSource(belief, texts, np.ones((1, goals), np.float32)),
-            Lanes(row + task_id(self.task), row, np.arange(goals, dtype=np.int32), placements),
+            jax.tree.map(lambda x: x[None], policy_params(self.run)),  # one policy
+            memory,
+            memory,
+            Lanes(row + task, np.arange(goals, dtype=np.int32), placements),
             np.bool_(True),
             jax.random.key(seed),
         )
@@ -310,11 +311,7 @@ def own_belief(learner: Learner, state: TrainState, ring: ReplayState, text: jax
     inference = learner.inference
     assert inference is not None
     seen, mask = stored_transitions(ring)
-    seen = replace(
-        seen,
-        obs=learner.normalize_obs(state.obs_stats, seen.obs),
-        next_obs=learner.normalize_obs(state.obs_stats, seen.next_obs),
-    )
+    seen = learner.normalized(state.obs_stats, seen)
     empty = init_belief((1,), inference.latent_dim)
     return inference.update_belief(
         state.encoder_params, empty, seen, mask, text[None], jnp.ones((1,))

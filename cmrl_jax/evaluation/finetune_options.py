@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cmrl_jax.config.schema import TASKS, Config, ConfigError
+from cmrl_jax.config.rules import require
+from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.registry import environment
 from envs.goal_names import GOALS
 
 # What gradient steps may change; `posterior`: nothing, `scratch`: SAC that begins from nothing.
@@ -50,9 +52,13 @@ def check_run(config: Config, options: FinetuneOptions) -> None:
     Raises:
         ConfigError: it was trained on the task, or lacks a part that a way to adapt needs.
     """
-    if options.task in config.tasks.train:
-        held = [task for task in TASKS if task not in config.tasks.train]
-        cause = f"the run was trained on {options.task}"
+    cause = f"finetune with algorithm {config.algorithm}"
+    require(config.algorithm == "cmrl", cause, "give a run of cmrl, whose learner it goes on with")
+    tasks = environment(config.env.name).tasks
+    if options.task in config.tasks.train or options.task not in tasks:
+        held = [task for task in tasks if task not in config.tasks.train]
+        was = "was trained on" if options.task in tasks else f"is of {config.env.name}, without"
+        cause = f"the run {was} {options.task}"
         raise ConfigError(cause, f"give --task one of: {', '.join(held) or 'none is left'}")
     # Without z a network is told the training tasks' one-hot, or nothing: no part of it is made for
     # another task.

@@ -151,17 +151,18 @@ def agent_of(
     seed: int,
 ) -> MetaWorldAgent:
     """The agent of a trial of one task, whose adaptation runs take these lanes of it in turn."""
-    names, train = lane_names(trial), session.config.tasks.train
+    names, train = lane_names(trial, session.env.tasks), session.config.tasks.train
     [task] = trial.tasks
+    env: Any = session.env  # Meta-World's own: `ml4`
     texts = np.repeat(trial.texts[0, 0], trial.draws, axis=0)  # (lane, G)
     return MetaWorldAgent(
-        session.config,
-        session.learner,
+        session.config.env,
+        session.agent,
         policy.params,
         texts=np.stack([texts[lanes] for lanes in runs]),
         lane_ids=np.stack([names[lanes] for lanes in runs]),
         train_row=train.index(task) if task in train else 0,
-        reset_lag=np.asarray(session.env.reset_lag(jnp.asarray(task_id(task)))),
+        reset_lag=np.asarray(env.reset_lag(jnp.asarray(task_id(task)))),
         horizon=horizon,
         seed=seed,
         z=trial.z,
@@ -228,7 +229,7 @@ def metaworlds_own(
     # Goals come in the environment's own order: runs are numbered, sentences taken in turn.
     runs = [np.array([n]) for n in range(len(placements))]
     agent = agent_of(session, policy, trial, runs, horizon, options.seed)
-    episodes = options.adaptation_episodes if session.learner.inference else 0
+    episodes = options.adaptation_episodes if session.agent.adapts else 0
     try:
         rate, mean_return, per_task = metalearning_evaluation(
             agent,

@@ -9,15 +9,16 @@ from typing import Any, Literal
 
 from cmrl_jax.commands import shown
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.rules import check_goal_set
+from cmrl_jax.config.rules import check_goal_set, require
 from cmrl_jax.config.schema import (
     MOST_EPISODES,
     MOST_STEPS,
-    TASKS,
     Config,
     ConfigError,
+    call_envs,
     suggest,
 )
+from cmrl_jax.registry import environment, rules_of, task_names
 from cmrl_jax.storage.run_dir import find_run
 from envs.command_line import LARGEST, brief, what_is
 from envs.goal_names import GOALS, LARGEST_SEED
@@ -86,8 +87,8 @@ def check_options(options: EvalOptions) -> None:
     _check_values(options)
     check_goal_set(options.goal_set, "--goal-set")
     for task in options.tasks or ():
-        if task not in TASKS:
-            cure = f"{suggest(task, TASKS)}valid: {', '.join(TASKS)}"
+        if task not in task_names():
+            cure = f"{suggest(task, task_names())}valid: {', '.join(task_names())}"
             raise ConfigError(f"unknown task '{task}' in --tasks", cure)
     for flag, values in (("tasks", options.tasks), ("k", options.k)):
         if values is not None and (not values or len(set(values)) < len(values)):
@@ -149,11 +150,18 @@ def check_run(options: EvalOptions, run: Path) -> Config:
         ConfigError: no run there, or one to which an option does not apply.
     """
     config = run_config(find_run(run))
-    conditioning, fusion = config.model.conditioning, config.encoder.goal_fusion
+    rules = call_envs(lambda: rules_of(config))
     k = options.k if options.k is not None else config.eval.final_k
     tasks = evaluated_tasks(options, config)
-    if conditioning != "z":
-        told = f"with model.conditioning {conditioning} ({run})"
+    own = environment(config.env.name).tasks
+    for task in tasks:
+        cure = f"name tasks of {config.env.name}: {', '.join(own)}"
+        require(task in own, f"--tasks {task}: another environment's than the run's", cure)
+    is_metaworlds = options.physics != "metaworld" or config.env.name == "ml4"
+    cause = f"--physics metaworld with env.name {config.env.name} ({run})"
+    require(is_metaworlds, cause, "leave it out: Meta-World has no such environment")
+    if not rules.adapts:
+        told = f"with {rules.kind} ({run})"
         if any(k):
             raise ConfigError(f"--k {shown(k)} {told}", "give --k 0: only a latent z can adapt")
         if options.z != "posterior":
@@ -162,19 +170,20 @@ def check_run(options: EvalOptions, run: Path) -> Config:
             cause = f"--adaptation-episodes {options.adaptation_episodes} {told}"
             raise ConfigError(cause, "leave it out: only a latent z can adapt")
         for task in tasks:
-            if task not in config.tasks.train:
-                cure = f"use its training tasks: {', '.join(config.tasks.train)}"
-                raise ConfigError(f"--tasks {task} {told}, which cannot know it", cure)
+            cure = f"use its training tasks: {', '.join(config.tasks.train)}"
+            require(
+                task in config.tasks.train, f"--tasks {task} {told}, which cannot know it", cure
+            )
     wants_text = (
         options.text is not None
         or options.paraphrases != "train"
         or options.text_control != "none"
         or options.z == "text"
     )
-    if wants_text and (conditioning != "z" or fusion == "none"):
+    if wants_text and not rules.reads_text:
         raise ConfigError(f"a text option with a policy that reads no text ({run})", "leave it out")
-    if options.z == "text" and fusion == "concat":
-        cause = f"--z text with encoder.goal_fusion concat ({run}): no experience, no text"
+    if options.z == "text" and not rules.can_start_from_text:
+        cause = f"--z text with {rules.kind} ({run}): no experience, no text"
         raise ConfigError(cause, "use --z prior, which is the same there")
     if options.z == "shuffled" and len(tasks) * options.goals * options.draws < 2:
         raise ConfigError("--z shuffled with one lane", "give more tasks, goals or draws")

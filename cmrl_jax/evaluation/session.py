@@ -1,4 +1,4 @@
-"""What a run is made of, built from its configuration: env, goals, learner, compiled programs.
+"""What a run is made of, built from its configuration: environment, goals, algorithm.
 
 Shared by training, evaluation and benchmarks.
 """
@@ -15,17 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState, make_learner
+from cmrl_jax.algorithms.base import Agent, Algorithm
 from cmrl_jax.config.schema import Config, call_envs
 from cmrl_jax.evaluation.controls import text_per_goal
-from cmrl_jax.evaluation.episode import PolicyParams
 from cmrl_jax.evaluation.evaluator import Evaluator, Trial
 from cmrl_jax.jax_runtime import cache_directory, check_switches, first_device
+from cmrl_jax.registry import make_algorithm, make_environment
 from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
 from cmrl_jax.text.goals import GoalTable, load_goals
-from envs.goal_sets import load_goal_set
-from envs.sawyer import Ml4Env
+from envs.base import MetaEnv
 
 
 def prepare_jax(config: Config) -> str:
@@ -50,7 +49,7 @@ def prepare_jax(config: Config) -> str:
 
 
 class Session:
-    """Env, goal vectors and learner of one configuration.
+    """Environment, goal vectors and algorithm of one configuration.
 
     Attributes:
         eval_tasks: training tasks, then test tasks.
@@ -60,22 +59,27 @@ class Session:
         self.config = config
         self.eval_tasks = config.tasks.train + config.tasks.test
         self.goals: GoalTable = load_goals(config.goals.table, self.eval_tasks)
-        env = config.env
-        self.env = call_envs(lambda: Ml4Env(env.goal_observable, env.physics, env.obs_mode))
+        self.env: MetaEnv = call_envs(lambda: make_environment(config.env))
         self.train_goals = jnp.asarray(self.goals.select(config.tasks.train).vectors)
-        self.learner: Learner = make_learner(config, self.train_goals)
+        self.algorithm: Algorithm = call_envs(
+            lambda: make_algorithm(config, self.env, self.train_goals)
+        )
+
+    @property
+    def agent(self) -> Agent:
+        return self.algorithm.agent
 
     def placements(
         self, goal_set: str, goals: int, tasks: Sequence[str] | None = None
     ) -> np.ndarray:
-        """The first `goals` placements of a named set (task, goal, 3), by default for all tasks."""
-        return call_envs(lambda: load_goal_set(goal_set, tasks or self.eval_tasks))[:, :goals]
+        """The first `goals` goals of a named set (task, goal, goal_size), by default for all."""
+        return call_envs(lambda: self.env.goals(goal_set, tasks or self.eval_tasks))[:, :goals]
 
     def train_placements(self) -> jax.Array | None:
-        """Placements that training draws from; None where it draws from the reset box."""
+        """Goals that training draws from; None where it draws by the environment's resets."""
         if self.config.env.variation == "episode_random":
             return None
-        train = call_envs(lambda: load_goal_set("train", self.config.tasks.train))
+        train = call_envs(lambda: self.env.goals("train", self.config.tasks.train))
         return jnp.asarray(train, jnp.float32)
 
     def trial(self, goal_set: str, goals: int) -> Trial:
@@ -88,7 +92,7 @@ class Session:
         return Evaluator(
             self.config,
             self.env,
-            self.learner,
+            self.agent,
             lanes=self.config.eval.goals * len(self.eval_tasks),
         )
 
@@ -103,7 +107,7 @@ class Policy:
         meta: the checkpoint's record (`checkpoint.META_FIELDS`).
     """
 
-    params: PolicyParams
+    params: Any
     goal_vectors: dict[str, np.ndarray]
     meta: dict[str, Any]
 
@@ -122,18 +126,13 @@ def load_policy(
         ConfigError: no such checkpoint, or it does not fit the session.
     """
     tasks = tuple(tasks or session.eval_tasks)
-    state = jax.eval_shape(session.learner.init, jax.random.key(0))
+    state = jax.eval_shape(session.algorithm.init, jax.random.key(0))
     shape = (len(tasks), session.goals.vectors.shape[-1])
     vectors = jax.ShapeDtypeStruct(shape, np.float32)
-    abstract = {"params": policy_params(state), "goal_vectors": vectors}
+    abstract = {"params": session.algorithm.policy_params(state), "goal_vectors": vectors}
     with policy_store(run, read_only=True) as store:
         trees, meta = store.restore(
             {"policy": abstract}, step=checkpoint, versions=package_versions()
         )
     found = np.asarray(trees["policy"]["goal_vectors"])
     return Policy(trees["policy"]["params"], dict(zip(tasks, found, strict=True)), meta)
-
-
-def policy_params(state: TrainState) -> PolicyParams:
-    """The part of the learner's state that acts."""
-    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)

@@ -6,10 +6,10 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from cmrl_jax.config.schema import TASKS, Config
+from cmrl_jax.config.schema import Config
 from cmrl_jax.evaluation.cells import RENAMED, UNNAMED
-from cmrl_jax.evaluation.controls import other_task
 from cmrl_jax.evaluation.options import DONATED, EvalOptions, evaluated_tasks
+from cmrl_jax.registry import other_task, task_names
 from cmrl_jax.storage.checkpoint import policy_digest
 from cmrl_jax.storage.versions import package_versions
 from cmrl_jax.text.goals import load_goals
@@ -24,7 +24,7 @@ def donors_of(options: EvalOptions, config: Config) -> str | None:
     """What decides from which lane another's z comes, None where no lane has another's."""
     if options.z not in DONATED:
         return None
-    tasks = sorted(evaluated_tasks(options, config), key=TASKS.index)
+    tasks = sorted(evaluated_tasks(options, config), key=task_names().index)
     return f"{'+'.join(tasks)} x {options.goals} goals x {options.draws} draws"
 
 

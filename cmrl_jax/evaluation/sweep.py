@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import jax
 
-from cmrl_jax.config.schema import TASKS, call_envs
+from cmrl_jax.config.schema import call_envs
 from cmrl_jax.evaluation.cells import CellTable
 from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.evaluation.options import DONATED, EvalOptions
@@ -41,6 +41,7 @@ from cmrl_jax.evaluation.trials import (
     trial_of,
 )
 from cmrl_jax.formats import format_duration
+from cmrl_jax.registry import task_names
 from cmrl_jax.stop import is_interrupt
 from envs.outputs import write_json
 
@@ -132,7 +133,7 @@ def evaluate_group(
     """Runs the pending tasks of targets that share a program, and writes their cells."""
     if not todo:
         return
-    targets = sorted(todo, key=lambda t: [TASKS.index(task) for task in todo[t]])
+    targets = sorted(todo, key=lambda t: [task_names().index(task) for task in todo[t]])
     prepare_jax(targets[0].config)  # each program has the precision of its own runs
     session = Session(targets[0].config)
     most = max(len(tasks) for tasks in todo.values())
@@ -162,7 +163,7 @@ def compiled_evaluator(
         evaluator = Evaluator(
             session.config,
             session.env,
-            session.learner,
+            session.agent,
             plan.lanes,
             options.horizon,
             policies=plan.policies,

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from cmrl_jax.config.schema import TASKS, Config, ConfigError, leaves
+from cmrl_jax.config.schema import Config, ConfigError, leaves
 from cmrl_jax.evaluation.cells import CellTable
 from cmrl_jax.evaluation.options import DONATED, EvalOptions, evaluated_tasks
 from cmrl_jax.evaluation.session import Policy, Session, load_policy
 from cmrl_jax.evaluation.settings import cell_columns, settings
 from cmrl_jax.evaluation.trials import evaluation_config
+from cmrl_jax.registry import rules_of, task_names
 from cmrl_jax.storage.checkpoint import policy_store
 
 
@@ -50,7 +51,7 @@ def targets_of(
     elif checkpoints == "last":
         steps = steps[-1:]
     k = options.k if options.k is not None else config.eval.final_k
-    tasks = sorted(evaluated_tasks(options, config), key=TASKS.index)
+    tasks = sorted(evaluated_tasks(options, config), key=task_names().index)
     return [Target(run, step, config, k, tuple(tasks)) for step in steps]
 
 
@@ -61,8 +62,10 @@ def program_key(target: Target) -> str:
     which nobody thought of here costs a compile, and never scores a policy as another's.
     """
     config = target.config
-    acting = [(name, value) for name, _, value in leaves(config) if not _is_idle(name)]
-    told = config.tasks.train if config.model.conditioning == "task_id" else ()
+    rules = rules_of(config)
+    idle = (*IDLE, *rules.IDLE)
+    acting = [(name, value) for name, _, value in leaves(config) if not _is_idle(name, idle)]
+    told = config.tasks.train if rules.is_told_the_task else ()
     return repr((acting, told, target.k))
 
 
@@ -71,44 +74,18 @@ IDLE = (
     "seed",
     "tasks.",  # told to a policy by `program_key`, where it is told them at all
     "env.variation",  # an evaluation names its placements
-    "kl.",
-    "collect.lanes",
-    "collect.updates_per_vector_step",
-    "collect.group_frac",
-    "collect.noise_correlation",
-    "collect.noise_scale",
-    "collect.initial",
-    "collect.context_source",
-    "collect.context_episodes",
-    "collect.context_lanes",
-    "sac.variant",
-    "sac.alpha",
-    "sac.alpha_init",
-    "sac.target_entropy",
-    "sac.gamma",
-    "sac.tau",
-    "sac.n_step",
-    "sac.reward_scale",
-    "sac.reward_norm",
-    "sac.return_max",
-    "sac.task_reduce",
-    "sac.loss_balance",
-    "sac.policy_reg",
-    "sac.batch",
-    "sac.task_rows",
-    "sac.lr",
-    "sac.grad_clip",
     "train.",
     "eval.",  # an evaluation has options of its own; k is part of the key
     "checkpoint.",
     "log.",
     "runtime.compile_cache",
 )
-"""Keys, and with a dot whole sections, that training reads and a policy that acts does not."""
+"""Keys, and with a dot whole sections, that training reads and a policy that acts does not; an
+algorithm's own are in its rules."""
 
 
-def _is_idle(name: str) -> bool:
-    return name in IDLE or any(name.startswith(x) for x in IDLE if x.endswith("."))
+def _is_idle(name: str, idle: tuple[str, ...]) -> bool:
+    return name in idle or any(name.startswith(x) for x in idle if x.endswith("."))
 
 
 def cells_per_task(target: Target, options: EvalOptions) -> int:

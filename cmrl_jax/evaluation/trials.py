@@ -13,10 +13,11 @@ import numpy as np
 
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import Config, ConfigError
-from cmrl_jax.evaluation.controls import other_task, text_per_goal
+from cmrl_jax.evaluation.controls import text_per_goal
 from cmrl_jax.evaluation.evaluator import Trial
 from cmrl_jax.evaluation.options import EvalOptions
 from cmrl_jax.evaluation.session import Policy, Session
+from cmrl_jax.registry import other_task
 from cmrl_jax.text.goals import GoalTable, load_goals
 
 LANES = {"cpu": 256}

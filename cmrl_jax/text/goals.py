@@ -17,8 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from cmrl_jax.commands import command
-from cmrl_jax.config.schema import GOAL_ABLATIONS, TASKS, ConfigError
+from cmrl_jax.config.schema import GOAL_ABLATIONS, ConfigError, call_envs
+from cmrl_jax.registry import tasks_beside
 from cmrl_jax.text.goal_files import find_table
+from envs.tasks import METAWORLD_TASKS
+
+ONE_HOT_WIDTH = 4  # at least: policies trained before a task was added keep their width
 
 
 @dataclass(frozen=True)
@@ -68,26 +72,22 @@ class GoalTable:
         )
 
 
-def load_goals(table: str, tasks: tuple[str, ...] = TASKS) -> GoalTable:
+def load_goals(table: str, tasks: tuple[str, ...] | None = None) -> GoalTable:
     """Returns the goal vectors of `tasks`.
 
     Args:
         table: an encoder whose table is packaged or was built, the path of an .npz, or an ablation:
-            `one-hot` says which task it is and nothing else (G = 4, the same row for a task
-            whatever the others are); `zero` is the default table with every vector 0, so shapes
+            `one-hot` says which task it is and nothing else, the same row for a task whatever the
+            others are; `zero` is the default table with every vector 0, so shapes
             and sentences stay; `shuffled` is the default table with another task's sentences for
             each task.
-        tasks: task names, the order of the arrays' first axis.
+        tasks: task names, the order of the arrays' first axis; None for all that the table has.
 
     Raises:
         ConfigError: unknown table or task; missing or corrupt file.
     """
     if table == "one-hot":
-        eye = np.eye(len(TASKS), dtype=np.float32)[:, None, :]  # (task, 1, G)
-        names = tuple((task,) for task in TASKS)
-        return _ablation(
-            GoalTable(TASKS, eye, eye, names, names, encoder=table, revision="", sha256="")
-        ).select(tasks)
+        return _one_hot(tasks)
     text = read_table(find_table(table))
     if table == "zero":
         text = replace(
@@ -102,7 +102,18 @@ def load_goals(table: str, tasks: tuple[str, ...] = TASKS) -> GoalTable:
         text = replace(text.select([text.tasks[row] for row in rows]), tasks=text.tasks)
     if table in GOAL_ABLATIONS:
         text = _ablation(replace(text, encoder=table, revision=""))
-    return text.select(tasks)
+    return text.select(tasks or text.tasks)
+
+
+def _one_hot(tasks: tuple[str, ...] | None) -> GoalTable:
+    beside = call_envs(lambda: tasks_beside(tasks[0] if tasks else METAWORLD_TASKS[0]))
+    tasks = tasks or beside[:ONE_HOT_WIDTH]
+    width = max(ONE_HOT_WIDTH, *(1 + beside.index(task) for task in tasks if task in beside))
+    known = beside[:width]
+    eye = np.eye(len(known), width, dtype=np.float32)[:, None, :]  # (task, 1, G)
+    names = tuple((task,) for task in known)
+    table = GoalTable(known, eye, eye, names, names, encoder="one-hot", revision="", sha256="")
+    return _ablation(table).select(tasks)
 
 
 def check_same_table(table: GoalTable, recorded_sha256: str, run: Path, cure: str = "") -> None:

@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.formats import format_figure
 
@@ -103,3 +105,22 @@ def _check_resumable(path: Path, header: bytes, offset: int) -> None:
         if file.read(1) != b"\n":
             cause = f"{path} does not end a row at byte {offset}, where its checkpoint was taken"
             raise ConfigError(cause, cure)
+
+
+def metric_names(metrics: dict[str, Any], tasks: tuple[str, ...]) -> list[str]:
+    """Columns of metrics.csv for one iteration's metrics: `train/x`, or `train/<task>/x`."""
+    names = []
+    for name, value in metrics.items():
+        per_task = [f"train/{task}/{name}" for task in tasks]
+        names += per_task if len(value.shape) else [f"train/{name}"]
+    return names
+
+
+def metric_row(metrics: dict[str, Any], tasks: tuple[str, ...]) -> dict[str, float | None]:
+    """Host figures of one iteration's metrics; NaN (no gradient step yet) becomes None."""
+    row: dict[str, float | None] = {}
+    for name, value in metrics.items():
+        values = np.atleast_1d(np.asarray(value))
+        for column, figure in zip(metric_names({name: value}, tasks), values, strict=True):
+            row[column] = None if np.isnan(figure) else float(figure)
+    return row

@@ -18,27 +18,18 @@ import jax
 import numpy as np
 
 from cmrl_jax import parallel
-from cmrl_jax.algorithms.cmrl.collect import (
-    RunState,
-    init_run,
-    make_train_iteration,
-    metric_names,
-    metric_row,
-)
-from cmrl_jax.config.rules import check_devices
+from cmrl_jax.algorithms.base import RunState
 from cmrl_jax.config.schema import Config, ConfigError, lanes_per_task
 from cmrl_jax.evaluation.scores import fault_warning, format_scores, of_policy, summarise
-from cmrl_jax.evaluation.session import Session, policy_params, prepare_jax
+from cmrl_jax.evaluation.session import Session, prepare_jax
+from cmrl_jax.registry import rules_of
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.checkpoint import full_store, join_run, policy_store, split_run
 from cmrl_jax.storage.run_dir import write_text
 from cmrl_jax.storage.versions import package_versions, write_versions
 from cmrl_jax.text.goals import check_same_table
 from cmrl_jax.training.loggers import Logger, Progress, RunInfo
-from cmrl_jax.training.metrics import (
-    LEADING_COLUMNS,
-    MetricsCsv,
-)
+from cmrl_jax.training.metrics import LEADING_COLUMNS, MetricsCsv, metric_names, metric_row
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
 
@@ -108,7 +99,7 @@ def train(
     """
     # All that refuses a configuration stands before the stores: they are what makes a run begin.
     device = prepare_jax(config)
-    check_devices(config, parallel.size(parallel.make_mesh()))
+    rules_of(config).check_devices(parallel.size(parallel.make_mesh()))
     session = Session(config)
     with full_store(run_dir, config.checkpoint.keep) as full, policy_store(run_dir) as policy:
         run = _Run(config, run_dir, session, full, policy, loggers, stop or Stop())
@@ -134,6 +125,7 @@ class _Run:
     ):
         self.config, self.run_dir, self.loggers, self.stop = config, run_dir, loggers, stop
         self.session, self.full, self.policy = session, full, policy
+        self.algorithm = session.algorithm
         self.schedule = Schedule.of(config)
 
     def say(self, text: str) -> None:
@@ -150,14 +142,8 @@ class _Run:
     def train(self, device: str, resume: bool) -> Outcome:
         self.say(f"device: {device}")
         mesh = parallel.make_mesh()
-        iteration = make_train_iteration(
-            self.config,
-            self.session.env,
-            self.session.learner,
-            self.session.train_goals,
-            self.session.train_placements(),
-        )
-        init = lambda key: init_run(self.config, self.session.learner, key)
+        iteration = self.algorithm.make_iteration(self.session.train_placements())
+        init = self.algorithm.init
         abstract = parallel.placed(jax.eval_shape(init, jax.random.key(0)), mesh)
         places = jax.tree.map(lambda leaf: leaf.sharding, abstract)
         # Jitted, so that every leaf has a buffer of its own: the iteration donates them all.
@@ -249,7 +235,7 @@ class _Run:
         row: dict[str, Any] = {
             "iteration": self.done - 1,
             "env_steps": steps,
-            "gradient_steps": int(self.state.learner.gradient_steps),
+            "gradient_steps": int(self.algorithm.gradient_steps(self.state)),
             "seed": config.seed,
             "time/iteration_s": seconds,
             "time/env_steps_per_s": self.schedule.steps_per_iteration / seconds,
@@ -316,7 +302,7 @@ class _Run:
     def scores(
         self, goals: int, k: tuple[int, ...], check: Callable[[], None] = lambda: None
     ) -> dict[str, Any]:
-        params = parallel.on_one_device(policy_params(self.state.learner))
+        params = parallel.on_one_device(self.algorithm.policy_params(self.state))
         trial = self.session.trial(self.config.eval.goal_set, goals)
         if not self.evaluator.is_compiled:
             width = trial.texts.shape[-1]
@@ -352,7 +338,7 @@ class _Run:
         # After the full one: a kill in between leaves a policy to write again, not one too many.
         if self.is_policy_due() or (self.done and is_last):
             policy = {
-                "params": policy_params(self.state.learner),
+                "params": self.algorithm.policy_params(self.state),
                 "goal_vectors": self.session.goals.vectors[:, 0],
             }
             self.policy.save({"policy": policy}, meta)

@@ -100,13 +100,13 @@ def measure(
 
     jax.config.update("jax_default_matmul_precision", "highest")
     from envs.parity import parts as parts
-    from envs.tasks import TASKS
+    from envs.tasks import METAWORLD_TASKS
 
     port = parts.Port(places.shape[0] * goals, physics)
-    tasks: dict[str, dict[str, Any]] = {task: {} for task in TASKS}
+    tasks: dict[str, dict[str, Any]] = {task: {} for task in METAWORLD_TASKS}
 
     def add(results: list[dict[str, Any]]) -> None:
-        for task, result in zip(TASKS, results, strict=True):
+        for task, result in zip(METAWORLD_TASKS, results, strict=True):
             tasks[task] |= result
 
     runs = {}
@@ -114,7 +114,12 @@ def measure(
         stream = parts.draw_noise(places, horizon, noise, seed)
         runs[f"{noise:g}"] = parts.measure_closed_loop(port, places, stream)
     add(next(iter(runs.values())))
-    add([{"closed_loop": {n: run[i] for n, run in runs.items()}} for i in range(len(TASKS))])
+    add(
+        [
+            {"closed_loop": {n: run[i] for n, run in runs.items()}}
+            for i in range(len(METAWORLD_TASKS))
+        ]
+    )
     if all_parts:
         rollouts = parts.record(places[:, :STATE_GOALS], horizon, seed)
         add(parts.measure_injected(port, rollouts))

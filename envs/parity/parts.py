@@ -1,7 +1,7 @@
 """The five measurements of `python -m envs.parity`: our environment against Meta-World's own.
 
-Every function returns one dict per task, in the order of `tasks.TASKS`. Both sides get the same
-states, actions, noise and goals; lanes are ordered task first, goal second. Lengths in metres.
+Every function returns one dict per task, in the order of `tasks.METAWORLD_TASKS`. Both sides get
+the same states, actions, noise and goals; lanes are ordered task first, goal second. Metres.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from envs.physics.mjx.backend import PhysicsState
 from envs.physics.model import FIXTURE_BODY, LEFT_FINGER, RIGHT_FINGER, SLIDE
 from envs.physics.native import NativePhysics, unpack
 from envs.sawyer import OBS_SIZE, Ml4Env, State
-from envs.tasks import SCENE_ID, SPECS, TASKS
+from envs.tasks import METAWORLD_TASKS, TASKS
+from envs.tasks.specs import SCENE_ID, SPECS
 
 OPEN_LOOP_STEPS = (1, 10, 50, 100, 150)
 ROLLOUTS = ("scripted", "perturbed", "random")
@@ -115,7 +116,7 @@ def record(goals: np.ndarray, steps: int, seed: int) -> list[Rollout]:
     """Scripted, perturbed and random episodes of Meta-World on goals (task, goal, 3)."""
     return [
         record_rollout(task, goal, kind, steps, seed=seed + number)
-        for task, places in zip(TASKS, goals, strict=True)
+        for task, places in zip(METAWORLD_TASKS, goals, strict=True)
         for number, goal in enumerate(places)
         for kind in ROLLOUTS
     ]
@@ -146,7 +147,7 @@ def quantiles(errors: np.ndarray) -> dict[str, float]:
 
 
 def measure_injected(
-    port: Port, rollouts: list[Rollout], tasks: Sequence[str] = TASKS
+    port: Port, rollouts: list[Rollout], tasks: Sequence[str] = METAWORLD_TASKS
 ) -> list[dict[str, Any]]:
     """Parts 1 and 2: observation, reward and success in given states, and one step from them."""
     return [_injected_task(port, task, [r for r in rollouts if r.task == task]) for task in tasks]
@@ -232,7 +233,7 @@ def is_touching(reference: ReferenceEnv) -> bool:
 
 
 def measure_open_loop(
-    port: Port, rollouts: list[Rollout], tasks: Sequence[str] = TASKS
+    port: Port, rollouts: list[Rollout], tasks: Sequence[str] = METAWORLD_TASKS
 ) -> list[dict[str, Any]]:
     """Part 3: their recorded actions replayed from their start state; errors grow over time."""
     chosen = [r for r in rollouts if r.task in tasks]
@@ -275,10 +276,12 @@ def _hand(rollout: Rollout, row: int) -> np.ndarray:
 def measure_resets(port: Port, goals: np.ndarray) -> list[dict[str, Any]]:
     """Part 5: start observations over goals (task, goal, 3)."""
     count = goals.shape[1]
-    task_ids = np.repeat(np.arange(len(TASKS), dtype=np.int32), count)
+    task_ids = np.repeat(np.int32([TASKS.index(task) for task in METAWORLD_TASKS]), count)
     ours = np.asarray(port.reset(task_ids, goals.reshape(-1, 3).astype(np.float32)).obs)
     results = []
-    for task, places, obs in zip(TASKS, goals, np.split(ours, len(TASKS)), strict=True):
+    for task, places, obs in zip(
+        METAWORLD_TASKS, goals, np.split(ours, len(METAWORLD_TASKS)), strict=True
+    ):
         reference = ReferenceEnv(task)
         theirs = np.stack([reference.reset(place) for place in places])
         results.append({"reset_obs_max": float(np.abs(obs - theirs).max())})
@@ -302,7 +305,7 @@ def port_episodes(port: Port, goals: np.ndarray, noise: np.ndarray) -> tuple[Any
     Faults (task, goal) count how often the physics of an episode became non-finite.
     """
     tasks, count = goals.shape[:2]
-    task_ids = np.repeat(np.arange(tasks, dtype=np.int32), count)
+    task_ids = np.repeat(np.int32([TASKS.index(task) for task in METAWORLD_TASKS]), count)
     policies = [scripted_policy(TASKS[i]) for i in task_ids]
     noise = noise.reshape(tasks * count, -1, 4)
     state = port.reset(task_ids, goals.reshape(-1, 3).astype(np.float32))
@@ -321,7 +324,7 @@ def port_episodes(port: Port, goals: np.ndarray, noise: np.ndarray) -> tuple[Any
 def reference_episodes(goals: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same in Meta-World: reward and success, (task, goal, step) each."""
     rewards, successes = np.zeros(noise.shape[:3]), np.zeros(noise.shape[:3], bool)
-    for i, task in enumerate(TASKS):
+    for i, task in enumerate(METAWORLD_TASKS):
         env, policy = ReferenceEnv(task), scripted_policy(task)
         for j, place in enumerate(goals[i]):
             obs = env.reset(place)
@@ -337,7 +340,7 @@ def measure_closed_loop(port: Port, goals: np.ndarray, noise: np.ndarray) -> lis
     theirs = reference_episodes(goals, noise)
     return [
         _compare(*(x[i] for x in (*ours, *theirs))) | {"faults": int(faults[i].sum())}
-        for i in range(len(TASKS))
+        for i in range(len(METAWORLD_TASKS))
     ]
 
 

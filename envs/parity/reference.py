@@ -33,14 +33,12 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.sawyer_xyz_env import SawyerXYZEnv
 
 from envs.adapters.metaworld_envs import make_task, metaworld_name
+from envs.tasks import METAWORLD_TASKS
 
 _POLICIES = {
-    "drawer-open": policies.SawyerDrawerOpenV3Policy,
-    "drawer-close": policies.SawyerDrawerCloseV3Policy,
-    "window-open": policies.SawyerWindowOpenV3Policy,
-    "window-close": policies.SawyerWindowCloseV3Policy,
+    task: getattr(policies, f"Sawyer{task.title().replace('-', '')}V3Policy")
+    for task in METAWORLD_TASKS
 }
-TASKS = tuple(_POLICIES)
 
 
 class Policy(Protocol):
@@ -157,7 +155,7 @@ class ReferenceEnv:
         """Loads the task's scene.
 
         Args:
-            task: one of `TASKS`.
+            task: one of `METAWORLD_TASKS`.
             goal_observable: show the target in the observation (Meta-World's MT mode; ML hides it).
 
         Raises:
@@ -326,7 +324,7 @@ def record_rollout(
     """Records one episode of Meta-World's environment.
 
     Args:
-        task: one of `TASKS`.
+        task: one of `METAWORLD_TASKS`.
         rand_vec: (3,) fixture position (m).
         policy: the scripted policy, uniform random actions, or the scripted policy's action,
             clipped to the box, plus Gaussian noise of standard deviation `noise`, clipped again.
@@ -385,4 +383,4 @@ def record_rollout(
 
 def _check_task(task: str) -> None:
     if task not in _POLICIES:
-        raise ValueError(f"unknown task {task!r}\nvalid tasks: {', '.join(TASKS)}")
+        raise ValueError(f"unknown task {task!r}\nvalid tasks: {', '.join(METAWORLD_TASKS)}")

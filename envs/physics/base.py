@@ -15,7 +15,8 @@ from flax import struct
 
 from envs.engine import mujoco
 from envs.physics.model import SLIDE, Fixture, load_scene
-from envs.tasks import SPECS, Task
+from envs.tasks.base import Task
+from envs.tasks.specs import SPECS
 
 SETTLE_STEPS, FRAME_SKIP = 50, 5  # SawyerXYZEnv._reset_hand; substeps of a control step
 MOCAP_QUAT = (1.0, 0.0, 1.0, 0.0)  # SawyerMocapBase: the hand points down; MuJoCo normalises it

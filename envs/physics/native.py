@@ -41,7 +41,8 @@ from envs.physics.model import (
     load_fixture,
     load_scene,
 )
-from envs.tasks import ACTION_SCALE, HAND_HIGH, HAND_LOW, SCENE_ID
+from envs.tasks.base import ACTION_SCALE, HAND_HIGH, HAND_LOW
+from envs.tasks.specs import SCENE_ID
 
 _BITS: Any = mujoco.mjtState
 # MuJoCo lays the parts of a state vector out in the order of their bits.

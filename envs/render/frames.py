@@ -59,7 +59,8 @@ def camera_of(task: str, placement: np.ndarray) -> Camera:
 def metaworld_scene(task: str, placement: np.ndarray) -> mujoco.MjModel:
     """Meta-World's scene of a task with fixture and goal mark where its reset puts them."""
     from envs.physics.model import FIXTURE_ROOT, load_scene
-    from envs.tasks import SPECS, task_id
+    from envs.tasks import task_id
+    from envs.tasks.specs import SPECS
 
     spec = SPECS[task_id(task)]
     model = load_scene(spec.scene)

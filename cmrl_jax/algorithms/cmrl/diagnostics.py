@@ -7,7 +7,6 @@ rules the critics (each task's share of the gradient norm, and how the tasks' gr
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -44,11 +43,7 @@ def make_diagnose(config: Config, learner: Learner, goal_vectors: jax.Array) -> 
             return {}
         largest = max(CONTEXT_SIZES)
         context = rings.sample_transitions(ring, key, jnp.arange(num_tasks), largest)
-        context = replace(
-            context,
-            obs=learner.normalize_obs(state.obs_stats, context.obs),
-            next_obs=learner.normalize_obs(state.obs_stats, context.next_obs),
-        )
+        context = learner.normalized(state.obs_stats, context)
         figures = {}
         for size in CONTEXT_SIZES:
             mask = jnp.broadcast_to(jnp.arange(largest) < size, (num_tasks, largest))

@@ -1,82 +1,132 @@
 """Control steps of many lanes: the piece that collection and evaluation share.
 
-A lane is one parallel environment; z stays fixed for the episode, so a rollout is a plain scan of
-policy and physics. Lanes of different tasks mix freely.
+A lane is one parallel environment, and lanes of different tasks mix freely. An episode ends in a
+true terminal, where the environment has any, or is cut by the time limit: the first lets no later
+reward count, the second must not.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from cmrl_jax import parallel
-from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.common.replay import Transition
-from envs.sawyer import ACTION_SIZE, Ml4Env, State
+from envs.base import MetaEnv
+
+Act = Callable[[jax.Array, jax.Array, jax.Array | None], jax.Array]
+"""(obs (lane, obs), key, noise (lane, act) or None) -> actions (lane, act)."""
 
 
 class StepStats(NamedTuple):
     """What a control step reports beside its transition, each (time, lane)."""
 
     success: jax.Array  # bool, at that very step
-    distance: jax.Array  # metres from object to target
+    distance: jax.Array  # the quantity success is judged by
 
 
 def rollout(
-    env: Ml4Env,
-    learner: Learner,
-    policy: tuple[object, object],
-    state: State,
-    zc: jax.Array,
+    env: MetaEnv,
+    act: Act,
+    state: Any,
     key: jax.Array,
     steps: int,
     horizon: int,
-    deterministic: bool = False,
+    begun: jax.Array | int = 0,
     random_actions: jax.Array | bool = False,
     noise: jax.Array | None = None,
-) -> tuple[State, Transition, StepStats]:
+    restart: Callable[[jax.Array], Any] | None = None,
+) -> tuple[Any, Transition, StepStats]:
     """Runs `steps` control steps of every lane.
 
     Args:
-        policy: actor_params and obs_stats.
         state: environment states, leading axis lane.
-        zc: conditioning (lane, conditioning), fixed for these steps.
-        horizon: control steps of an episode; the transition that ends it is truncated.
+        horizon: control steps after which whatever episode a lane is in is cut.
+        begun: how many of those have passed.
         random_actions: () bool; uniform actions in place of the policy's.
-        noise: (steps, lane, act) standard normal, in place of independent draws.
+        noise: (steps, lane, act) standard normal, for `act`.
+        restart: key -> fresh states of all lanes, which those take whose episode has ended in a
+            terminal; None leaves them where they are, and their later steps mean nothing.
 
     Returns:
         The new states, and transitions and statistics with leading axes (time, lane).
     """
-    actor_params, obs_stats = policy
     lanes = state.obs.shape[0]
 
-    def step(state: State, inputs: tuple[jax.Array, jax.Array | None]):
-        key, step_noise = inputs
+    def step(state: Any, inputs: tuple[jax.Array, jax.Array, jax.Array | None]):
+        time, key, step_noise = inputs
         k_act, k_uniform = jax.random.split(key)
-        given = () if step_noise is None else (step_noise,)
-        action, _ = learner.policy(
-            actor_params, obs_stats, state.obs, zc, k_act, deterministic, *given
-        )
-        uniform = jax.random.uniform(k_uniform, (lanes, ACTION_SIZE), minval=-1.0, maxval=1.0)
+        action = act(state.obs, k_act, step_noise)
+        uniform = jax.random.uniform(k_uniform, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(random_actions, uniform, action)
         new = parallel.by_part(jax.vmap(env.step))(state, action)
+        terminated = new.terminated if env.can_terminate else jnp.zeros((lanes,), bool)
         transition = Transition(
             obs=state.obs,
             action=action,
             reward=new.reward,
-            terminated=jnp.zeros((lanes,), bool),  # Meta-World has no terminal states
-            truncated=new.steps >= horizon,
+            terminated=terminated,
+            truncated=jnp.broadcast_to(time + 1 >= horizon, (lanes,)),
             first=state.steps == 0,
             next_obs=new.obs,
         )
-        return new, (transition, StepStats(new.success, new.distance))
+        stats = StepStats(new.success, new.distance)
+        if env.can_terminate and restart is not None:
+            new = select_lanes(terminated, restart(jax.random.fold_in(key, 0)), new)
+        return new, (transition, stats)
 
-    inputs = (jax.random.split(key, steps), noise)
+    inputs = (begun + jnp.arange(steps), jax.random.split(key, steps), noise)
     state, (transitions, stats) = jax.lax.scan(step, state, inputs)
     return state, transitions, stats
+
+
+def select_lanes(chosen: jax.Array, new: Any, old: Any) -> Any:
+    """`new` for the lanes that are chosen (lane,), `old` for the others; pytrees of lanes."""
+    broadcast = lambda leaf: chosen.reshape(chosen.shape + (1,) * (leaf.ndim - 1))
+    return jax.tree.map(lambda x, y: jnp.where(broadcast(y), x, y), new, old)
+
+
+class EpisodeFigures(NamedTuple):
+    """Figures of each lane's first episode in a stretch of steps, each (...)."""
+
+    success_any: jax.Array  # at any step
+    success_last: jax.Array  # at its last step
+    returns: jax.Array
+    final_distance: jax.Array  # at its last step
+
+
+def episode_figures(
+    reward: jax.Array, stats: StepStats, terminated: jax.Array | None
+) -> EpisodeFigures:
+    """Figures of lanes that begin an episode at the first of these steps.
+
+    Args:
+        reward: (time, ...), as are the others, any axes of lanes.
+        terminated: what comes after the first True does not count; None: nothing terminates.
+    """
+    success, distance = stats
+    if terminated is None:
+        last = lambda x: x[-1]
+    else:
+        counts = is_before_the_end(terminated)
+        reward, success = reward * counts, success & counts
+        end = jnp.sum(counts, 0, dtype=jnp.int32) - 1
+        last = lambda x: jnp.take_along_axis(x, end[None], 0)[0]
+    return EpisodeFigures(
+        success_any=jnp.any(success, 0),
+        success_last=last(success),
+        returns=jnp.sum(reward, 0),
+        final_distance=last(distance),
+    )
+
+
+def is_before_the_end(terminated: jax.Array) -> jax.Array:
+    """Which steps (time, ...) belong to each lane's first episode: up to and with its terminal."""
+    ends = jnp.cumsum(terminated, 0)
+    return ends - terminated == 0
 
 
 def correlated_noise(

@@ -33,7 +33,7 @@ from envs.physics.model import (
     load_fixture,
     load_scene,
 )
-from envs.tasks import ACTION_SCALE, HAND_HIGH, HAND_LOW
+from envs.tasks.base import ACTION_SCALE, HAND_HIGH, HAND_LOW
 
 SUBSTEPS = FRAME_SKIP
 SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6

@@ -1,0 +1,118 @@
+"""CMRL's agent: z is drawn from the belief at the start of an episode, and kept for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from cmrl_jax.algorithms.base import Array, RunState, Told
+from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.algorithms.common.replay import Transition
+from cmrl_jax.nn.context import Belief, init_belief
+
+
+class PolicyParams(NamedTuple):
+    """What acting needs: the policy checkpoint's arrays."""
+
+    actor_params: Any
+    encoder_params: Any  # None without a latent
+    obs_stats: Any
+
+
+def policy_params(run: RunState) -> PolicyParams:
+    """The part of a run's state that acts."""
+    state = run.learner
+    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
+
+
+@struct.dataclass
+class Memory:
+    """What a lane has seen and been told, leading axis lane.
+
+    Attributes:
+        belief: over all transitions so far; None without a latent.
+        text: (lane, G).
+        text_mask: (lane,).
+        conditioning: what the networks are told in this episode (lane, conditioning): z, or the
+            task where there is no latent.
+    """
+
+    belief: Belief | None
+    text: Array
+    text_mask: Array
+    conditioning: Array
+
+
+@dataclass(frozen=True)
+class CmrlAgent:
+    """An `Agent`; PEARL's, MTSAC's and SAC's too.
+
+    Args:
+        learner: of the configuration.
+        chunk: control steps between two calls of `observe`.
+    """
+
+    learner: Learner
+    chunk: int
+
+    @property
+    def adapts(self) -> bool:
+        return self.learner.inference is not None
+
+    def init(self, told: Told) -> Memory:
+        inference, lead = self.learner.inference, told.task_row.shape
+        if inference is None:
+            belief, conditioning = None, self.learner.task_conditioning(told.task_row)
+        else:
+            belief = init_belief(lead, inference.latent_dim)
+            conditioning = jnp.zeros((*lead, inference.latent_dim))
+        return Memory(belief, told.text, told.text_mask, conditioning)
+
+    def begin_episode(
+        self, params: PolicyParams, memory: Memory, source: Memory, keys: jax.Array
+    ) -> Memory:
+        inference = self.learner.inference
+        if inference is None:
+            return memory
+        posterior = inference.posterior_of_belief(
+            params.encoder_params, source.belief, source.text, source.text_mask
+        )
+        return replace(
+            memory,
+            conditioning=inference.z_of_noise(posterior, z_noise(keys, inference.latent_dim)),
+        )
+
+    def act(
+        self, params: PolicyParams, memory: Memory, obs: Array, noise: Array, deterministic: Any
+    ) -> jax.Array:
+        action, _ = self.learner.policy(
+            params.actor_params,
+            params.obs_stats,
+            obs,
+            memory.conditioning,
+            None,
+            deterministic,
+            noise,
+        )
+        return action
+
+    def observe(
+        self, params: PolicyParams, memory: Memory, transitions: Transition, mask: Array
+    ) -> Memory:
+        inference = self.learner.inference
+        if inference is None:
+            return memory
+        normalized = self.learner.normalized(params.obs_stats, transitions)
+        belief = inference.update_belief(
+            params.encoder_params, memory.belief, normalized, mask, memory.text, memory.text_mask
+        )
+        return replace(memory, belief=belief)
+
+
+def z_noise(keys: jax.Array, latent_dim: int) -> jax.Array:
+    """Standard normal numbers (lane, latent), each lane's from its own key (lane,)."""
+    return jax.vmap(lambda key: jax.random.normal(key, (latent_dim,)))(keys)

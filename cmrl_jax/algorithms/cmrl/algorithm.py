@@ -1,0 +1,39 @@
+"""CMRL as an entry of the registry: learner, agent and training iteration of one configuration.
+
+PEARL, MTSAC and SAC are configurations of it.
+"""
+
+from __future__ import annotations
+
+import jax
+
+from cmrl_jax.algorithms.base import Algorithm, RunState
+from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, policy_params
+from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
+from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.config.schema import Config
+from envs.base import MetaEnv
+
+
+def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
+    """The algorithm of a configuration; its `parts` are the `Learner`.
+
+    Args:
+        goal_vectors: text vectors of the training tasks (task, paraphrase, G).
+    """
+    learner = Learner(config, goal_vectors, env.observation_size, env.action_size)
+
+    def make_iteration(goals: jax.Array | None) -> TrainIteration:
+        return TrainIteration(config, env, learner, goal_vectors, goals)
+
+    def gradient_steps(run: RunState) -> jax.Array:
+        return run.learner.gradient_steps
+
+    return Algorithm(
+        agent=CmrlAgent(learner, config.collect.chunk),
+        init=lambda key: init_run(config, env, learner, key),
+        make_iteration=make_iteration,
+        policy_params=policy_params,
+        gradient_steps=gradient_steps,
+        parts=learner,
+    )
