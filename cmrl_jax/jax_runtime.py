@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,16 @@ def first_device() -> Any:
         cause = f"jax finds no device for JAX_PLATFORMS={platforms}: {lines[0][:200]}"
         cure = "unset JAX_PLATFORMS to take the device that is there, or install jax for that one"
         raise ConfigError(cause, cure) from error
+
+
+def jit_once(function: Callable[..., Any], **options: Any) -> Any:
+    """`jax.jit` for a program that runs once: compiled with little optimisation, in a third of the
+    time for initial states (12.2 against 3.6 s; the numbers are the same).
+
+    Args:
+        options: of `jax.jit`.
+    """
+    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 1}, **options)
 
 
 @functools.cache  # so that a process that asks again is not told again

@@ -59,15 +59,15 @@ class MetaEnv(Protocol):
     tasks: tuple[str, ...]
     can_terminate: bool
 
-    def reset(self, key: jax.Array, task_id: jax.Array) -> Any:
+    def reset(self, key: jax.Array, task_id: jax.Array, /) -> Any:
         """A fresh episode of a task on a random goal: MetaState."""
         ...
 
-    def reset_to(self, task_id: jax.Array, goal: jax.Array) -> Any:
+    def reset_to(self, task_id: jax.Array, goal: jax.Array, /) -> Any:
         """A fresh episode on a goal (goal_size,): MetaState."""
         ...
 
-    def step(self, state: Any, action: jax.Array) -> Any:
+    def step(self, state: Any, action: jax.Array, /) -> Any:
         """The MetaState after an action (action_size,), one control step later."""
         ...
 

@@ -281,5 +281,5 @@ def test_a_fault_while_adapting_counts_for_what_was_adapted(evaluator, policy, t
 
 def test_lanes_of_the_most_draws_have_names_of_their_own():
     texts = np.zeros((1, 4, GOALS, 1))
-    names = lane_names(Trial(TASKS, np.zeros((4, GOALS, 3)), texts, draws=MOST_DRAWS))
+    names = lane_names(Trial(TASKS, np.zeros((4, GOALS, 3)), texts, draws=MOST_DRAWS), TASKS)
     assert len(np.unique(names)) == 4 * GOALS * MOST_DRAWS and names.min() >= 0

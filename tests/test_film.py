@@ -20,6 +20,7 @@ from cmrl_jax.analysis.render import FilmedEnv, film_run
 from cmrl_jax.config.files import load_config, to_yaml
 from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.evaluation.session import Policy, Session
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
 from envs.goal_sets import load_goal_set
@@ -37,7 +38,7 @@ def session():
 
 @pytest.fixture(scope="module")
 def params(session):
-    state = jax.jit(session.algorithm.parts.init)(jax.random.key(3))
+    state = jit_once(session.algorithm.parts.init)(jax.random.key(3))
     return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
 
 

@@ -29,6 +29,7 @@ from cmrl_jax.evaluation.finetune import (
 )
 from cmrl_jax.evaluation.finetune_options import ADAPT, FinetuneOptions, check_run
 from cmrl_jax.evaluation.session import Session
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.nn.context import init_belief
 from cmrl_jax.text.goals import load_goals
 from envs.physics.native import NativePhysics
@@ -82,7 +83,7 @@ def test_a_free_latent_is_one_point_and_learns(ring):
     config = tiny_config(encoder={"information_bottleneck": False})
     latent = free_latent(config.encoder.latent_dim)
     learner = RestrictedLearner("z", config, GOALS, 3, 2, inference=latent)
-    state = jax.jit(learner.init)(jax.random.key(0))
+    state = jit_once(learner.init)(jax.random.key(0))
     z = jnp.array([0.3, -0.2])
     params = {"z": z}
     state = replace(state, encoder_params=params, encoder_opt_state=finetune.init_adam(params))
@@ -135,7 +136,7 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         critic_params=spread(made.state.critic_params),
         log_alpha=jnp.array([-1.0, -2.0, -6.0]),
     )
-    fresh = jax.jit(learner.init)(jax.random.key(5))
+    fresh = jit_once(learner.init)(jax.random.key(5))
     state = start_state("all", config, learner, fresh, trained, GOALS[0, 0])
     assert not changed(trained, state)
     np.testing.assert_allclose(state.log_alpha, [-3.0])  # the mean of the training tasks'

@@ -14,6 +14,7 @@ from cmrl_jax.algorithms.cmrl.learner import Learner, per_task
 from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch, routing_health
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.config.schema import Config
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.nn.distributions import sample_tanh_gaussian
 from cmrl_jax.nn.networks import Routing
 from cmrl_jax.nn.optimizers import adam_step, clip_by_norm, init_adam, ravel, unravel
@@ -89,7 +90,7 @@ def build(cfg):
     learner = Learner(cfg, GOALS, OBS, ACT)
     return SimpleNamespace(
         learner=learner,
-        state=jax.jit(learner.init)(jax.random.key(0)),
+        state=jit_once(learner.init)(jax.random.key(0)),
         update=jax.jit(learner.update),
     )
 

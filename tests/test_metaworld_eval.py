@@ -340,8 +340,8 @@ def test_the_command_writes_both_figures(session, tmp_path, capsys, refused):
 
 
 def test_names_of_lanes_do_not_depend_on_their_company(session, trial):
-    every = lane_names(replace(trial, draws=2)).reshape(4, LANES, 2)
+    every = lane_names(replace(trial, draws=2), session.env.tasks).reshape(4, LANES, 2)
     assert len(np.unique(every)) == every.size
     for row in range(4):
-        alone = lane_names(of_task(trial, row).of_goal(1))
+        alone = lane_names(of_task(trial, row).of_goal(1), session.env.tasks)
         assert alone.item() == every[row, 1, 0]

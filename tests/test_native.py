@@ -16,6 +16,7 @@ from env_fixtures import LANE_GOALS, LANE_TASKS, LANES
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config
 from cmrl_jax.evaluation.session import Session
+from cmrl_jax.jax_runtime import jit_once
 from envs.parity.reference import ReferenceEnv, scripted_policy
 from envs.physics.native import NativePhysics, unpack
 from envs.sawyer import OBS_MODES, Ml4Env, State
@@ -215,7 +216,7 @@ def test_two_training_iterations_are_finite_and_repeat():
     session = Session(config)
     iteration = session.algorithm.make_iteration(session.train_placements())
     program = jax.jit(iteration)
-    init = jax.jit(session.algorithm.init)
+    init = jit_once(session.algorithm.init)
     runs = []
     for _ in range(2):
         state, _ = program(init(jax.random.key(config.seed)))

@@ -31,7 +31,7 @@ from envs.tasks import TASKS
 from envs.tasks.specs import SPECS
 
 ROOT = Path(__file__).parent.parent
-SCENE = {spec.name: spec.scene for spec in SPECS}
+SCENE = {task: spec.scene for task, spec in zip(TASKS, SPECS, strict=True)}
 FINGERS = ("rightclaw_it", "rightpad_geom", "leftclaw_it", "leftpad_geom")
 
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmrl_jax.algorithms.cmrl import learner as learner_module
 from cmrl_jax.algorithms.cmrl import losses
 from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.algorithms.cmrl.objectives import Objectives
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.config.schema import Config
 
@@ -146,18 +146,13 @@ def test_the_right_losses_solve_both_tasks_and_only_by_z():
 
 def frozen_encoder(monkeypatch):
     """The critic loss sees z without its gradient: the encoder is left with the KL."""
-    make = learner_module.make_objectives
+    right = Objectives.critic
 
-    def make_without_gradient(*args):
-        objectives = make(*args)
+    def without_gradient(self, trained, *rest):
+        stopped = jax.lax.stop_gradient(trained.encoder)
+        return right(self, trained._replace(encoder=stopped), *rest)
 
-        def critic(trained, *rest):
-            stopped = jax.lax.stop_gradient(trained.encoder)
-            return objectives.critic(trained._replace(encoder=stopped), *rest)
-
-        return replace(objectives, critic=critic)
-
-    monkeypatch.setattr(learner_module, "make_objectives", make_without_gradient)
+    monkeypatch.setattr(Objectives, "critic", without_gradient)
 
 
 def flipped_actor_loss(monkeypatch):

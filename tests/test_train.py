@@ -20,6 +20,7 @@ from cmrl_jax.algorithms.cmrl.rules import lane_groups
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config
 from cmrl_jax.evaluation.session import Session, load_policy
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.storage.checkpoint import full_store
 from cmrl_jax.text import goal_files
 
@@ -209,7 +210,7 @@ def test_each_preset_runs_two_iterations_at_smoke_size(preset):
         return iteration(state)
 
     program = jax.jit(counted)
-    state = jax.jit(session.algorithm.init)(jax.random.key(0))
+    state = jit_once(session.algorithm.init)(jax.random.key(0))
     state, first = program(state)
     before = state.learner.actor_params
     state, second = program(state)

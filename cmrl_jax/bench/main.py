@@ -28,6 +28,7 @@ from cmrl_jax.commands import CHILD
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import Config, ConfigError, call_envs
 from cmrl_jax.evaluation.session import Session, prepare_jax
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.places import ROOT
 from cmrl_jax.storage.versions import package_versions
 from envs.outputs import write_json
@@ -61,7 +62,7 @@ def bench_learner(config: Config, report: Report) -> None:
     """Gradient steps a second on rings full of random transitions."""
     session = Session(config)
     learner, env = session.algorithm.parts, session.env
-    run = jax.jit(session.algorithm.init)(jax.random.key(0))
+    run = jit_once(session.algorithm.init)(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), 4)
     lead = (config.env.horizon, len(config.tasks.train), run.replay.lanes_per_task)
     flag = jnp.zeros(lead, bool)

@@ -29,6 +29,7 @@ from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config
 from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
 from cmrl_jax.evaluation.finetune_options import FinetuneOptions
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.nn import normalizers
 from cmrl_jax.nn.context import Belief, ContextInference, init_belief, make_context_inference
 from cmrl_jax.nn.distributions import Gaussian
@@ -254,8 +255,8 @@ class FineTuning:
         self.iteration = jax.jit(iteration, donate_argnums=0)
         self.episode = jax.jit(make_episode(self.env, self.agent, self.config.env.horizon))
         # As programs: op by op, each of their hundreds of shapes would be compiled by itself.
-        init = jax.jit(lambda key: init_run(self.config, self.env, learner, key))
-        start = jax.jit(
+        init = jit_once(lambda key: init_run(self.config, self.env, learner, key))
+        start = jit_once(
             lambda fresh, trained, text: start_state(
                 adapt, self.config, learner, fresh, trained, text
             )

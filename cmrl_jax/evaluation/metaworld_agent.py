@@ -31,7 +31,9 @@ from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.algorithms.common.rollout import select_lanes
 from cmrl_jax.config.schema import EnvConfig
 from cmrl_jax.evaluation.episode import action_noise, agent_keys, chunk_keys
-from envs.sawyer import ACTION_SIZE, OBJECT, OBS_SIZE, canonical_obs
+from envs.sawyer import OBJECT, Ml4Env, canonical_obs
+
+OBS_SIZE, ACTION_SIZE = Ml4Env.observation_size, Ml4Env.action_size
 
 
 class Timestep(Protocol):

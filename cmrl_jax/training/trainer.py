@@ -22,6 +22,7 @@ from cmrl_jax.algorithms.base import RunState
 from cmrl_jax.config.schema import Config, ConfigError, lanes_per_task
 from cmrl_jax.evaluation.scores import fault_warning, format_scores, of_policy, summarise
 from cmrl_jax.evaluation.session import Session, prepare_jax
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.registry import rules_of
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.checkpoint import full_store, join_run, policy_store, split_run
@@ -147,7 +148,7 @@ class _Run:
         abstract = parallel.placed(jax.eval_shape(init, jax.random.key(0)), mesh)
         places = jax.tree.map(lambda leaf: leaf.sharding, abstract)
         # Jitted, so that every leaf has a buffer of its own: the iteration donates them all.
-        self.init = jax.jit(init, out_shardings=places)
+        self.init = jit_once(init, out_shardings=places)
         with parallel.using(mesh):
             # Traced once, for the columns and for the program: tracing the physics takes seconds.
             program = jax.jit(iteration, donate_argnums=0, out_shardings=(places, None))

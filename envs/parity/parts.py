@@ -35,6 +35,9 @@ SUCCESS_DISTANCE = {
 }
 
 
+METAWORLD_IDS = np.array([TASKS.index(task) for task in METAWORLD_TASKS], np.int32)
+
+
 class Port:
     """Our environment as compiled functions of a fixed number of lanes.
 
@@ -276,7 +279,7 @@ def _hand(rollout: Rollout, row: int) -> np.ndarray:
 def measure_resets(port: Port, goals: np.ndarray) -> list[dict[str, Any]]:
     """Part 5: start observations over goals (task, goal, 3)."""
     count = goals.shape[1]
-    task_ids = np.repeat(np.int32([TASKS.index(task) for task in METAWORLD_TASKS]), count)
+    task_ids = np.repeat(METAWORLD_IDS, count)
     ours = np.asarray(port.reset(task_ids, goals.reshape(-1, 3).astype(np.float32)).obs)
     results = []
     for task, places, obs in zip(
@@ -305,7 +308,7 @@ def port_episodes(port: Port, goals: np.ndarray, noise: np.ndarray) -> tuple[Any
     Faults (task, goal) count how often the physics of an episode became non-finite.
     """
     tasks, count = goals.shape[:2]
-    task_ids = np.repeat(np.int32([TASKS.index(task) for task in METAWORLD_TASKS]), count)
+    task_ids = np.repeat(METAWORLD_IDS, count)
     policies = [scripted_policy(TASKS[i]) for i in task_ids]
     noise = noise.reshape(tasks * count, -1, 4)
     state = port.reset(task_ids, goals.reshape(-1, 3).astype(np.float32))

@@ -21,7 +21,7 @@ from cmrl_jax.algorithms.cmrl.objectives import (
     CriticSide,
     Metrics,
     Minibatch,
-    make_objectives,
+    Objectives,
 )
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.config.schema import Config, lanes_per_task
@@ -110,7 +110,7 @@ class Learner:
         if inference is None and self.has_encoder:
             inference = make_context_inference(config, self.networks)
         self.inference = inference
-        self.objectives = make_objectives(config, self.networks, inference, action_size)
+        self.objectives = Objectives(config, self.networks, inference, action_size)
 
     def normalize_obs(self, obs_stats: Any, obs: jax.Array) -> jax.Array:
         """Observations (..., obs) as the networks read them; the identity by configuration."""

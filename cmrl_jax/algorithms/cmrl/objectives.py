@@ -7,8 +7,6 @@ trained transitions, and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -70,26 +68,6 @@ class ActorSide(NamedTuple):
     value: Params | None
 
 
-@dataclass(frozen=True)
-class Objectives:
-    """Pure functions, all randomness in the minibatch. Per-row metrics are (task,), others ().
-
-    Attributes:
-        infer: (encoder_params, Minibatch) -> conditioning zc (task, conditioning) and KL nats
-            (task, latent) or None.
-        critic: (CriticSide, actor_params, target_params, log_alpha, Minibatch) -> loss, (zc,
-            metrics). `target_params` are the target critics' or the target V network's.
-        actor: (ActorSide, critic_params, zc, log_alpha, Minibatch) -> loss, (log_prob (task,
-            batch), metrics).
-        alpha: (log_alpha (T,), log_prob, task_ids) -> loss.
-    """
-
-    infer: Callable[..., tuple[jax.Array, jax.Array | None]]
-    critic: Callable[..., tuple[jax.Array, tuple[jax.Array, Metrics]]]
-    actor: Callable[..., tuple[jax.Array, tuple[jax.Array, Metrics]]]
-    alpha: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
-
-
 def routing_health(routing: Routing, task_ids: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Routing entropy / log n of each row, (task,), and the distance between tasks, ().
 
@@ -107,96 +85,120 @@ def routing_health(routing: Routing, task_ids: jax.Array) -> tuple[jax.Array, ja
     return jnp.mean(entropy, axis=(1, 2)), distance
 
 
-def make_objectives(
-    cfg: Config, networks: Networks, inference: ContextInference | None, action_size: int
-) -> Objectives:
-    """The objectives of one configuration; `inference` is None without an encoder."""
-    sac, model = cfg.sac, cfg.model
-    is_categorical = model.critic == "c51"
-    support = losses.critic_support(model.critic_v_max, model.critic_bins)
+class Objectives:
+    """Pure functions of one configuration, all randomness in the minibatch.
 
-    def infer(encoder_params: Params | None, data: Minibatch) -> tuple[jax.Array, jax.Array | None]:
-        if inference is None or data.z_noise is None:
-            if model.conditioning == "task_id":
-                return jax.nn.one_hot(data.task_ids, networks.conditioning_size), None
+    Per-row metrics are (task,), others ().
+
+    Args:
+        inference: None without an encoder.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        networks: Networks,
+        inference: ContextInference | None,
+        action_size: int,
+    ):
+        self.config, self.networks, self.inference = config, networks, inference
+        self.action_size = action_size
+        self.is_categorical = config.model.critic == "c51"
+        self.support = losses.critic_support(config.model.critic_v_max, config.model.critic_bins)
+
+    def infer(
+        self, encoder_params: Params | None, data: Minibatch
+    ) -> tuple[jax.Array, jax.Array | None]:
+        """Conditioning zc (task, conditioning) and KL nats (task, latent), or None for these."""
+        if self.inference is None or data.z_noise is None:
+            if self.config.model.conditioning == "task_id":
+                return jax.nn.one_hot(data.task_ids, self.networks.conditioning_size), None
             return jnp.zeros((data.task_ids.shape[0], 0)), None
-        posterior = inference.posterior(
+        posterior = self.inference.posterior(
             encoder_params, data.context, data.context_mask, data.goal, data.goal_mask
         )
-        kl = kl_to_standard_normal(posterior) if cfg.encoder.information_bottleneck else None
-        return inference.z_of_noise(posterior, data.z_noise), kl
+        has_kl = self.config.encoder.information_bottleneck
+        kl = kl_to_standard_normal(posterior) if has_kl else None
+        return self.inference.z_of_noise(posterior, data.z_noise), kl
 
-    def act(actor_params: Params, obs: jax.Array, zb: jax.Array, noise: jax.Array):
-        mean, log_std, routing = networks.actor(actor_params, obs, zb[:, None])
+    def act(self, actor_params: Params, obs: jax.Array, zb: jax.Array, noise: jax.Array):
+        mean, log_std, routing = self.networks.actor(actor_params, obs, zb[:, None])
         action, log_prob = sample_tanh_gaussian(mean, log_std, noise)
         return action, log_prob, (mean, log_std, routing)
 
-    def expected_q(head: jax.Array) -> jax.Array:
-        return jax.nn.softmax(head, axis=-1) @ support if is_categorical else head
+    def expected_q(self, head: jax.Array) -> jax.Array:
+        return jax.nn.softmax(head, axis=-1) @ self.support if self.is_categorical else head
 
-    def critic_target(actor_params, target_params, alpha, zb, data: Minibatch):
+    def critic_target(self, actor_params, target_params, alpha, zb, data: Minibatch):
         """The target, (task, batch) or (task, batch, bin), and its clipped share."""
-        if sac.variant == "v":
-            next_value = networks.value(target_params, data.next_obs, zb[:, None])
+        if self.config.sac.variant == "v":
+            next_value = self.networks.value(target_params, data.next_obs, zb[:, None])
             return losses.td_target(data.reward, data.discount, next_value), None
-        next_action, next_log_prob, _ = act(actor_params, data.next_obs, zb, data.next_noise)
-        next_head = networks.critic(target_params, data.next_obs, next_action, zb[:, None])
-        if is_categorical:
+        next_action, next_log_prob, _ = self.act(actor_params, data.next_obs, zb, data.next_noise)
+        next_head = self.networks.critic(target_params, data.next_obs, next_action, zb[:, None])
+        if self.is_categorical:
             return losses.categorical_target(
                 next_head,
                 next_log_prob,
                 data.reward,
                 data.discount,
                 alpha,
-                support,
-                model.critic_agg,
+                self.support,
+                self.config.model.critic_agg,
             )
         next_value = losses.soft_value(next_head, next_log_prob, alpha)
         return losses.td_target(data.reward, data.discount, next_value), None
 
-    def auxiliary(encoder_params: Params, zc: jax.Array, data: Minibatch) -> jax.Array:
-        if networks.reconstruct is not None:
-            predicted = networks.reconstruct(encoder_params, data.obs, data.action, zc[:, None])
+    def auxiliary(self, encoder_params: Params, zc: jax.Array, data: Minibatch) -> jax.Array:
+        if self.networks.reconstruct is not None:
+            predicted = self.networks.reconstruct(
+                encoder_params, data.obs, data.action, zc[:, None]
+            )
             change = data.next_obs - data.obs
             return jnp.mean(losses.reconstruction_loss(predicted, data.reward, change))
-        assert inference is not None and data.context_mask is not None
+        assert self.inference is not None and data.context_mask is not None
         goal, shown = data.goal, jnp.ones(data.task_ids.shape)
         seen = jnp.ones_like(data.context_mask)
-        experience = inference.posterior(encoder_params, data.context, seen, goal, 0.0 * shown)
-        nothing = init_belief(data.task_ids.shape, inference.latent_dim)
-        text = inference.posterior_of_belief(encoder_params, nothing, goal, shown)
+        experience = self.inference.posterior(encoder_params, data.context, seen, goal, 0.0 * shown)
+        nothing = init_belief(data.task_ids.shape, self.inference.latent_dim)
+        text = self.inference.posterior_of_belief(encoder_params, nothing, goal, shown)
         return losses.contrastive_loss(experience.mean, text.mean, data.task_ids)
 
-    def critic(trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
-        zc, kl = infer(trained.encoder, data)
+    def critic(self, trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
+        """Loss, (zc, metrics); `target_params` are the target critics' or the V network's."""
+        config = self.config
+        zc, kl = self.infer(trained.encoder, data)
         alpha = jnp.exp(log_alpha)[data.task_ids]
         zb = stop_gradient(zc)  # the target is stopped as a whole; this spares tracing its tangents
-        target, clipped = critic_target(actor_params, target_params, alpha, zb, data)
-        head = networks.critic(trained.critic, data.obs, data.action, zc[:, None])
-        loss_of = losses.categorical_critic_loss if is_categorical else losses.critic_loss
+        target, clipped = self.critic_target(actor_params, target_params, alpha, zb, data)
+        head = self.networks.critic(trained.critic, data.obs, data.action, zc[:, None])
+        loss_of = losses.categorical_critic_loss if self.is_categorical else losses.critic_loss
         td_loss = loss_of(head, target)
-        weights = losses.task_weights(log_alpha, sac.loss_balance)[data.task_ids]
-        loss = losses.over_tasks(td_loss, weights, sac.task_reduce)
+        weights = losses.task_weights(log_alpha, config.sac.loss_balance)[data.task_ids]
+        loss = losses.over_tasks(td_loss, weights, config.sac.task_reduce)
         metrics = {"critic_loss": loss, "td_loss": td_loss}
-        metrics["q_mean"] = jnp.mean(expected_q(head), axis=(0, 2))
+        metrics["q_mean"] = jnp.mean(self.expected_q(head), axis=(0, 2))
         if clipped is not None:
             metrics["clipped_target_fraction"] = clipped
-        if cfg.encoder.aux != "none":
-            metrics["aux_loss"] = auxiliary(trained.encoder, zc, data)
-            loss = loss + cfg.encoder.aux_weight * metrics["aux_loss"]
+        if config.encoder.aux != "none":
+            metrics["aux_loss"] = self.auxiliary(trained.encoder, zc, data)
+            loss = loss + config.encoder.aux_weight * metrics["aux_loss"]
         if kl is not None:
-            loss = loss + cfg.kl.beta * losses.kl_loss(kl, cfg.kl.reduce, cfg.kl.free_bits)
+            kl_loss = losses.kl_loss(kl, config.kl.reduce, config.kl.free_bits)
+            loss = loss + config.kl.beta * kl_loss
             metrics["kl"] = jnp.sum(kl, axis=-1)
             metrics["active_dims"] = jnp.sum(jnp.mean(kl, axis=0) > 0.05).astype(jnp.float32)
         return loss, (zc, metrics)
 
-    def actor(trained: ActorSide, critic_params, zc, log_alpha, data: Minibatch):
+    def actor(self, trained: ActorSide, critic_params, zc, log_alpha, data: Minibatch):
+        """Loss, (log_prob (task, batch), metrics)."""
+        sac = self.config.sac
         zb = stop_gradient(zc)
         alpha = jnp.exp(log_alpha)[data.task_ids]
-        action, log_prob, (mean, log_std, routing) = act(
+        action, log_prob, (mean, log_std, routing) = self.act(
             trained.actor, data.obs, zb, data.action_noise
         )
-        q = expected_q(networks.critic(critic_params, data.obs, action, zb[:, None]))
+        q = self.expected_q(self.networks.critic(critic_params, data.obs, action, zb[:, None]))
         row_loss = losses.actor_loss(q, log_prob, alpha)
         if sac.policy_reg:
             row_loss = row_loss + sac.policy_reg * losses.policy_regulariser(mean, log_std)
@@ -208,17 +210,16 @@ def make_objectives(
             health = routing_health(routing, data.task_ids)
             metrics["routing_entropy"], metrics["routing_distance"] = health
         if sac.variant == "v":
-            value = networks.value(trained.value, data.obs, zb[:, None])
+            value = self.networks.value(trained.value, data.obs, zb[:, None])
             target = losses.soft_value(q, log_prob, alpha)
             row_loss = losses.value_loss(value, target)
             metrics["value_loss"] = losses.over_tasks(row_loss, weights, sac.task_reduce)
             loss = loss + metrics["value_loss"]
         return loss, (log_prob, metrics)
 
-    def alpha(log_alpha: jax.Array, log_prob: jax.Array, task_ids: jax.Array) -> jax.Array:
-        if sac.alpha == "shared":
+    def alpha(self, log_alpha: jax.Array, log_prob: jax.Array, task_ids: jax.Array) -> jax.Array:
+        """Loss of the temperatures log_alpha (T,)."""
+        if self.config.sac.alpha == "shared":
             log_alpha = jnp.full_like(log_alpha, 1.0) * jnp.mean(log_alpha)
-        target = sac.target_entropy * action_size
+        target = self.config.sac.target_entropy * self.action_size
         return losses.alpha_loss(log_alpha[task_ids], log_prob, target)
-
-    return Objectives(infer, critic, actor, alpha)
