@@ -11,13 +11,12 @@ from policy_fixtures import HORIZON, MovingEnv, random_policy, small_config
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.evaluation.controls import donors
 from cmrl_jax.evaluation.evaluator import Evaluator, Trial, lane_names
-from cmrl_jax.evaluation.options import MOST_DRAWS
+from cmrl_jax.evaluation.options import MOST_DRAWS, Z_SOURCES
 from cmrl_jax.evaluation.session import Session
 from envs.goal_names import GOALS
 from envs.tasks import TASKS, task_id
 
 LANES = 5  # of a batch: fewer than any evaluation here has, and no divisor of them
-Z_SOURCES = ("posterior", "prior", "shuffled", "other", "text")
 
 
 @pytest.fixture(scope="module")

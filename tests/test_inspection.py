@@ -70,7 +70,7 @@ def played(session, params, zc):
 
 
 def usage_by_hand(params, obs, z):
-    """Algorithm section 3 in float64, two layers of two: P_1 (target, ..., source) and p_o."""
+    """docs/algorithm.md in float64, two layers of two: P_1 (target, ..., source) and p_o."""
     p = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params.actor_params["params"])
     relu = lambda y: np.maximum(y, 0)
     linear = lambda name, y: y @ p[name]["kernel"] + p[name]["bias"]

@@ -41,7 +41,7 @@ def spread(params, seed=0):
 
 
 def forward_by_loops(p, x, z, layers, n, router_input, trunk_input, norm, temperature):
-    """One sample of algorithm section 3 in float64, module by module."""
+    """One sample of docs/algorithm.md's soft modules in float64, module by module."""
     p = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), p)
 
     def linear(name, y):

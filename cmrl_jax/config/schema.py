@@ -3,7 +3,7 @@
 Every key has its help text beside it (`doc`), which is what `train.py --help` prints. The rules
 that span keys live in `rules.py`, reading YAML and flags in `files.py`. None of the three imports
 jax or mujoco, so that a typo is reported at once.
-Preset values and their sources: algorithm.md section 9 (see the comments in `configs/*.yaml`).
+Preset values and their sources: the comments in `configs/*.yaml`; formulas: docs/algorithm.md.
 """
 
 from __future__ import annotations

@@ -1,17 +1,45 @@
-"""Controls of an evaluation: whose belief a lane's z is drawn from, and whose sentence it is given.
+"""Controls of an evaluation: what an episode is acted on in place of the lane's own memory.
 
 They answer "is z used, is the text?": a policy whose score survives another lane's z does not use
-z. Neither depends on the order in which tasks are evaluated: whose sentence a lane is given is the
-registry's matter (`registry.other_task`), whose belief goes by the tasks' ids.
+z. None depends on the order in which tasks are evaluated; whose sentence a lane is given is the
+registry's matter (`registry.other_task`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import jax
 import numpy as np
 
+from cmrl_jax.algorithms.base import Told
+from cmrl_jax.evaluation.episode import Lanes
+from cmrl_jax.evaluation.options import ZSource
+
 _SHUFFLE_SEED = 0  # one derangement for everybody, so that runs are compared lane by lane
+
+
+def sources(
+    z: ZSource, lanes: Lanes, told: Told, blank: Callable[[Told], Any]
+) -> Callable[[Any, np.ndarray], Any]:
+    """What lanes act on: (memories of all lanes (policy, lane, ...), chosen lanes) -> theirs.
+
+    Args:
+        z: `posterior` the own memory; `text` one without experience; `prior` one without text,
+            either; `shuffled` and `other` another lane's, see `donors`.
+        told: what the lanes are told (policy, lane, ...).
+        blank: the memories of lanes that have seen nothing.
+    """
+    take = lambda memories, index: jax.tree.map(lambda x: x[:, index], memories)
+    if z == "text":
+        inexperienced = blank(told)
+        return lambda _, index: take(inexperienced, index)
+    if z == "prior":
+        ignorant = blank(told._replace(text_mask=np.zeros_like(told.text_mask)))
+        return lambda _, index: take(ignorant, index)
+    donor = donors(z, lanes.lane_id, lanes.env_task)
+    return lambda memories, index: take(memories, donor[index])
 
 
 def donors(z: str, lane_id: np.ndarray, env_task: np.ndarray) -> np.ndarray:

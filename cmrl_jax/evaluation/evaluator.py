@@ -21,9 +21,9 @@ import numpy as np
 
 from cmrl_jax.algorithms.base import Agent, Told
 from cmrl_jax.config.schema import Config
-from cmrl_jax.evaluation.controls import donors
+from cmrl_jax.evaluation.controls import sources
 from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
-from cmrl_jax.evaluation.options import MOST_DRAWS
+from cmrl_jax.evaluation.options import MOST_DRAWS, ZSource
 from envs.base import MetaEnv
 
 GOAL_IDS = 1000  # more than the goals of any set
@@ -40,7 +40,7 @@ class Trial:
         texts: text vector that a lane is given (policy, task, goal, G).
         first_goal: number of the first goal, by which its lanes' noise is named.
         draws: z draws a goal.
-        z: one of `options.Z_SOURCES`.
+        z: what episodes are acted on, see `controls.sources`.
         deterministic: whether actions are the tanh of the mean.
     """
 
@@ -49,7 +49,7 @@ class Trial:
     texts: np.ndarray
     first_goal: int = 0
     draws: int = 1
-    z: str = "posterior"
+    z: ZSource = "posterior"
     deterministic: bool = True
 
     def of_goal(self, goal: int) -> Trial:
@@ -155,7 +155,8 @@ class Evaluator:
         shape = (len(policies), *trial.placements.shape[:2], trial.draws)
         lanes, told = self.lanes_of(trial), self.told_of(trial)
         total = len(lanes.lane_id)
-        memories, source_of = self._blank(told), self._sources(trial, lanes, told)
+        source_of = sources(trial.z, lanes, told, self._blank)
+        memories = self._blank(told)
         key = jax.random.key(seed)
         for episode in range(count):
             # Every batch acts on what was known before the episode, its donors' lanes too.
@@ -179,17 +180,6 @@ class Evaluator:
             joined = jax.tree.map(lambda *x: np.concatenate(x, 1)[:, :total], *parts)
             known = jax.tree.map(lambda x: x[: shape[0]], before)
             yield known, jax.tree.map(lambda x: x[: shape[0]].reshape(shape), joined)
-
-    def _sources(self, trial: Trial, lanes: Lanes, told: Told) -> Callable[[Any, Any], Any]:
-        """What lanes act on, by the trial's control: (memories, index of lanes) -> memories."""
-        if trial.z == "text":
-            told_alone = self._blank(told)
-            return lambda _, index: jax.tree.map(lambda x: x[:, index], told_alone)
-        if trial.z == "prior":
-            nothing = self._blank(told._replace(text_mask=np.zeros_like(told.text_mask)))
-            return lambda _, index: jax.tree.map(lambda x: x[:, index], nothing)
-        donor = donors(trial.z, lanes.lane_id, lanes.env_task)
-        return lambda memories, index: jax.tree.map(lambda x: x[:, donor[index]], memories)
 
     def _blank(self, told: Told) -> Any:
         """Memories of lanes that have seen nothing, numpy (policy, lane, ...)."""

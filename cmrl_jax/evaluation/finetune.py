@@ -4,7 +4,7 @@ One lane gathers episode after episode of the task, on goals of its own; gradien
 `adapt` allows, as many in the first episode as in every later one, so that after k episodes the
 ways that learn have made equally many. At the read-outs the policy is scored on a named goal set: z
 from the belief over all own transitions, no further adaptation. Normalisers stay those of training,
-and rewards are divided by the mean of the training tasks' denominators (algorithm.md 4.5, 5.6);
+and rewards are divided by the mean of the training tasks' denominators;
 `scratch` is SAC that knows nothing: its first episode has random actions, and it keeps statistics
 of its own.
 """

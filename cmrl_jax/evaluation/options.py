@@ -23,12 +23,9 @@ from cmrl_jax.storage.run_dir import find_run
 from envs.command_line import LARGEST, brief, what_is
 from envs.goal_names import GOALS, LARGEST_SEED
 
-Z_SOURCES = ("posterior", "prior", "shuffled", "other", "text")
-
-
+ZSource = Literal["posterior", "prior", "shuffled", "other", "text"]
+Z_SOURCES: tuple[ZSource, ...] = typing.get_args(ZSource)
 DONATED = ("shuffled", "other")  # z from another lane's belief: lanes depend on one another
-
-
 # A draw is one of the numbers that name a lane's noise, in 32 bits (`evaluate.lane_names`), and
 # every lane keeps its text in memory.
 MOST_DRAWS = 10_000
@@ -48,7 +45,8 @@ class EvalOptions:
         horizon: control steps an episode.
         physics: backend to evaluate in.
         policy: deterministic (tanh of the mean) or sampled actions.
-        z: where z comes from; posterior is the protocol, the others are controls.
+        z: what an episode is acted on; posterior is the protocol, the others are controls
+            (controls.py).
         paraphrases: sentences of the table, the first trained on or the held-out ones.
         text_control: whose sentence a lane is given: its task's, another task's, a zero vector.
         text: one sentence for every lane, in place of the table's.
@@ -67,7 +65,7 @@ class EvalOptions:
     horizon: int | None = None
     physics: Literal["mjx", "native", "metaworld"] | None = None
     policy: Literal["deterministic", "sampled"] = "deterministic"
-    z: Literal["posterior", "prior", "shuffled", "other", "text"] = "posterior"
+    z: ZSource = "posterior"
     paraphrases: Literal["train", "heldout"] = "train"
     text_control: Literal["none", "shuffled", "zero"] = "none"
     text: str | None = None

@@ -51,7 +51,7 @@ class Initialisers(NamedTuple):
 
 
 def make_initialisers(scheme: str) -> Initialisers:
-    """Initialisers of `model.init`: `official` or `flax` (algorithm section 3)."""
+    """Initialisers of `model.init`: `official` or `flax`, see the NOTES of networks.py."""
     small = symmetric_uniform(HEAD_SCALE)
     if scheme == "official":
         return Initialisers(

@@ -62,7 +62,7 @@ def mix(weights: jax.Array, modules: jax.Array) -> jax.Array:
 
 
 class SoftModularNet(nn.Module):
-    """Soft-modular network, algorithm section 3; all widths and options of `ModelConfig`."""
+    """Soft-modular network (docs/algorithm.md); all widths and options of `ModelConfig`."""
 
     layers: int
     modules: int
@@ -128,7 +128,7 @@ class SoftModularNet(nn.Module):
 
 
 class ContextEncoder(nn.Module):
-    """One Gaussian factor a transition, and one of the goal text (algorithm sections 2.1 - 2.3).
+    """One Gaussian factor a transition, and one of the goal text (docs/algorithm.md).
 
     With `encoder.aux: recon` also the decoder that z is trained through.
     """

@@ -67,7 +67,7 @@ def normalize_obs(stats: ObsStats, obs: jax.Array) -> jax.Array:
 
 @struct.dataclass
 class ReturnStats:
-    """Statistics of running discounted returns G (algorithm.md 4.5).
+    """Statistics of running discounted returns G.
 
     Attributes:
         returns: (task, lane) G of each lane.

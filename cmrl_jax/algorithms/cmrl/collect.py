@@ -33,7 +33,7 @@ from cmrl_jax.nn import normalizers
 from envs.base import MetaEnv
 
 LATE_STEPS = 50  # the last steps of an episode, whose mean reward shows the grip-and-wait optimum
-Z_SOURCES = ("prior", "text", "posterior")
+LANE_GROUPS = ("prior", "text", "posterior")
 
 
 def context_writers(config: Config) -> int:
@@ -89,7 +89,7 @@ class TrainIteration:
         ids = jnp.array([env.tasks.index(name) for name in config.tasks.train])
         self.env_task = jnp.repeat(ids, self.per_task)
         self.train_task = jnp.repeat(jnp.arange(self.num_tasks), self.per_task)  # row of the rings
-        # (lane,) index of Z_SOURCES.
+        # (lane,) index of LANE_GROUPS.
         self.source = np.tile(np.repeat(np.arange(3), lane_groups(config)), self.num_tasks)
         self.noise_scale = make_noise_scale(config)
         self.diagnose = make_diagnose(config, learner, goal_vectors)
@@ -151,7 +151,7 @@ class TrainIteration:
             flat(reward), StepStats(*map(flat, stats)), flat(terminated)
         )
         if self.learner.inference is not None:
-            for index, name in enumerate(Z_SOURCES):
+            for index, name in enumerate(LANE_GROUPS):
                 metrics[f"episodes_{name}"] = jnp.sum(actual_source == index).astype(jnp.float32)
         metrics["physics_faults"] = jnp.sum(state.faults).astype(jnp.float32)
         denominator = normalizers.reward_denominator(run.learner.return_stats, config.sac)

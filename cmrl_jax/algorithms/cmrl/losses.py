@@ -1,4 +1,4 @@
-"""The losses, one equation each (algorithm section 4).
+"""The losses, one equation each (docs/algorithm.md).
 
 All act on arrays that the networks have already computed, with leading dims (task, batch) or
 (critic, task, batch), and return one loss per task row, which `over_tasks` reduces. What is

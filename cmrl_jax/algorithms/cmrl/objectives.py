@@ -1,6 +1,6 @@
 """What is differentiated with respect to what: the losses joined to the networks.
 
-Gradient routing (algorithm section 4): the encoder learns from the critic loss, the KL and the
+Gradient routing: the encoder learns from the critic loss, the KL and the
 auxiliary loss of `encoder.aux`, nothing else. So z enters with its gradient in `critic`, at the
 trained transitions, and nowhere else.
 """

@@ -175,7 +175,7 @@ def sample(
 
     From step t, m <= n_step steps of the same lane count: reward = sum_{j<m} gamma^j r_{t+j},
     next_obs is that of the m-th step, discount = gamma^m (1 - terminated). A window stops at the
-    end of its episode and at the write head (algorithm.md 4.1, 5.1). An empty ring gives zeros.
+    end of its episode and at the write head. An empty ring gives zeros.
 
     Args:
         state: the replay ring.
