@@ -5,12 +5,12 @@ An entry says where to find what builds it, so that a typo is reported before ja
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from envs.command_line import suggest
 from envs.tasks import REGISTRY
 
 
@@ -147,9 +147,8 @@ def other_task(task: str) -> str:
 
 def _found(entries: Mapping[str, Any], name: str, kind: str) -> Any:
     if name not in entries:
-        close = difflib.get_close_matches(name, entries, n=1)
-        meant = f"did you mean '{close[0]}'? " if close else ""
-        raise ValueError(f"unknown {kind} '{name}'\n{meant}valid: {', '.join(entries)}")
+        valid = f"valid: {', '.join(entries)}"
+        raise ValueError(f"unknown {kind} '{name}'\n{suggest(name, entries)}{valid}")
     return entries[name]
 
 

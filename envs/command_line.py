@@ -8,10 +8,11 @@ lines, cause and cure.
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
 import stat
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -41,6 +42,12 @@ def run(command: Callable[[], None]) -> int:
         print(f"error: {cause}\nfix: {cure}", file=sys.stderr)
         return 2
     return 0
+
+
+def suggest(word: str, valid: Iterable[str]) -> str:
+    """`did you mean 'x'? ` where something is close, else nothing."""
+    close = difflib.get_close_matches(word, list(valid), n=1)
+    return f"did you mean '{close[0]}'? " if close else ""
 
 
 def brief(text: str | Path) -> str:

@@ -6,9 +6,7 @@ the goals themselves.
 
 from __future__ import annotations
 
-import difflib
-
-from envs.command_line import LARGEST, brief
+from envs.command_line import LARGEST, brief, suggest
 
 GOALS = 50
 """Goals of one task in a set: what Meta-World's task maker draws."""
@@ -29,8 +27,7 @@ def seed_of(name: str) -> int:
         return SEEDS[name]
     kind, _, digits = name.partition(":")
     if kind != "fresh" or not (digits.isascii() and digits.isdigit()):
-        close = difflib.get_close_matches(name, SEEDS, n=1)
-        meant = f"did you mean '{close[0]}'? " if close else ""
+        meant = suggest(name, SEEDS)
         valid = f"valid: {', '.join(SEEDS)}, fresh:<seed>, as fresh:7"
         raise ValueError(f"'{brief(name)}' is no goal set\n{meant}{valid}")
     if len(digits.lstrip("0")) > len(str(LARGEST_SEED)) or int(digits) > LARGEST_SEED:

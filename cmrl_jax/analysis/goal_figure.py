@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from cmrl_jax.analysis.pca import principal_axes
-from cmrl_jax.config.schema import ConfigError, as_config_error
+from cmrl_jax.config.schema import ConfigError, as_config_error, call_envs
 from cmrl_jax.text.goal_builder import all_vectors, task_cosines
 from cmrl_jax.text.goals import GoalTable
+from envs.figures import pyplot_for
 from envs.outputs import save_figure
 
 
@@ -19,14 +20,7 @@ def draw(table: GoalTable, out: Path) -> None:
     Raises:
         ConfigError: matplotlib is not installed, or `out` cannot be written.
     """
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-    except ImportError as error:
-        cure = "pip install 'cmrl-jax[viz]'"
-        raise ConfigError("--figure needs matplotlib, which is not installed", cure) from error
+    pyplot = call_envs(lambda: pyplot_for("--figure"))
     every = all_vectors(table)
     tasks, count, _ = every.shape
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(12.5, 5.4), layout="constrained")

@@ -20,7 +20,7 @@ import numpy as np
 from cmrl_jax.analysis.inspection_figures import plot_latents, plot_routing
 from cmrl_jax.analysis.inspection_file import read_inspection
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.schema import Config, ConfigError, as_config_error
+from cmrl_jax.config.schema import Config, ConfigError, as_config_error, call_envs
 from cmrl_jax.evaluation.statistics import interquartile_mean, seeds_band
 from cmrl_jax.storage.output_files import writable
 from cmrl_jax.storage.run_files import (
@@ -32,6 +32,7 @@ from cmrl_jax.storage.run_files import (
     read_metrics,
 )
 from cmrl_jax.storage.run_groups import group_runs, settings_of, shown_names
+from envs.figures import pyplot_for
 from envs.outputs import save_figure, written_by
 
 Series = list[tuple[float, float]]
@@ -139,15 +140,7 @@ def _check_alike(evaluations: Mapping[Path, Evaluation]) -> None:
 
 
 def _pyplot(needed_by: str = "plot") -> Any:
-    try:
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-    except ImportError as error:
-        cure = "pip install 'cmrl-jax[viz]'"
-        raise ConfigError(f"{needed_by} needs matplotlib, which is not installed", cure) from error
-    return pyplot
+    return call_envs(lambda: pyplot_for(needed_by))
 
 
 def _panels(pyplot: Any, runs: Runs, ylabel: str) -> tuple[Any, dict[str, Any]]:

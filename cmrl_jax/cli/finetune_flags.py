@@ -6,10 +6,10 @@ import argparse
 
 from cmrl_jax.cli.flags import add_force, goal_count, names, seed
 from cmrl_jax.config.rules import check_goal_set
-from cmrl_jax.config.schema import MOST_EPISODES, MOST_UPDATES, ConfigError, suggest
+from cmrl_jax.config.schema import MOST_EPISODES, MOST_UPDATES, ConfigError
 from cmrl_jax.evaluation.finetune_options import ADAPT, FinetuneOptions
 from cmrl_jax.registry import task_names
-from envs.command_line import typed_path, whole
+from envs.command_line import suggest, typed_path, whole
 from envs.goal_names import GOALS
 
 DESCRIPTION = "Adapts a trained policy to a task it never saw, with gradient steps on its own data."

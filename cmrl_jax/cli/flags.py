@@ -11,8 +11,8 @@ import argparse
 from collections.abc import Callable, Sequence
 
 from cmrl_jax.commands import program
-from cmrl_jax.config.schema import MOST_EPISODES, MOST_STEPS, ConfigError, call_envs, suggest
-from envs.command_line import Parser, whole
+from cmrl_jax.config.schema import MOST_EPISODES, MOST_STEPS, ConfigError, call_envs
+from envs.command_line import Parser, suggest, whole
 from envs.goal_names import GOALS, LARGEST_SEED
 from envs.outputs import FORCE_HELP
 

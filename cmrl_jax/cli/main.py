@@ -21,14 +21,14 @@ from cmrl_jax.cli.flags import COMMANDS, add_force, names, parse, parser_of
 from cmrl_jax.config.files import (
     run_config,
 )
-from cmrl_jax.config.schema import ConfigError, call_envs, suggest
+from cmrl_jax.config.schema import ConfigError, call_envs
 from cmrl_jax.evaluation import finetune_options
 from cmrl_jax.stop import is_interrupt
 from cmrl_jax.storage.output_files import distinct, writable
 from cmrl_jax.storage.run_dir import (
     find_run,
 )
-from envs.command_line import typed_path
+from envs.command_line import suggest, typed_path
 from envs.outputs import written_by
 
 

@@ -19,10 +19,10 @@ import yaml
 
 from cmrl_jax.commands import quoted
 from cmrl_jax.config.rules import validate
-from cmrl_jax.config.schema import Config, ConfigError, leaves, suggest
+from cmrl_jax.config.schema import Config, ConfigError, leaves
 from cmrl_jax.config.yaml_tree import read_scalar, read_tree
 from cmrl_jax.places import PACKAGE
-from envs.command_line import brief
+from envs.command_line import brief, suggest
 
 # What a resumed run may change: how long it trains, and what it reports. Not `eval.k`, by which
 # columns of metrics.csv are named.

@@ -13,10 +13,9 @@ from cmrl_jax.config.schema import (
     ConfigError,
     call_envs,
     leaves,
-    suggest,
 )
 from cmrl_jax.registry import environment, rules_of
-from envs.command_line import LARGEST
+from envs.command_line import LARGEST, suggest
 from envs.goal_names import seed_of
 
 

@@ -9,7 +9,6 @@ Preset values and their sources: the comments in `configs/*.yaml`; formulas: doc
 from __future__ import annotations
 
 import contextlib
-import difflib
 from collections.abc import Callable, Iterator
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import Any, Literal
@@ -293,9 +292,3 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Field, Any]]:
 def lanes_per_task(config: Config) -> int:
     """Parallel environments of each training task."""
     return config.collect.lanes // len(config.tasks.train)
-
-
-def suggest(word: str, valid: tuple[str, ...] | list[str]) -> str:
-    """`did you mean 'x'? ` where something is close, else nothing."""
-    close = difflib.get_close_matches(word, valid, n=1)
-    return f"did you mean '{close[0]}'? " if close else ""

@@ -16,11 +16,10 @@ from cmrl_jax.config.schema import (
     Config,
     ConfigError,
     call_envs,
-    suggest,
 )
 from cmrl_jax.registry import environment, rules_of, task_names
 from cmrl_jax.storage.run_dir import find_run
-from envs.command_line import LARGEST, brief, what_is
+from envs.command_line import LARGEST, brief, suggest, what_is
 from envs.goal_names import GOALS, LARGEST_SEED
 
 ZSource = Literal["posterior", "prior", "shuffled", "other", "text"]

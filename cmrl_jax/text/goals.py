@@ -6,7 +6,6 @@ an encoder.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import io
 import zipfile
@@ -20,6 +19,7 @@ from cmrl_jax.commands import command
 from cmrl_jax.config.schema import GOAL_ABLATIONS, ConfigError, call_envs
 from cmrl_jax.registry import tasks_beside
 from cmrl_jax.text.goal_files import find_table
+from envs.command_line import suggest
 from envs.tasks import METAWORLD_TASKS
 
 ONE_HOT_WIDTH = 4  # at least: policies trained before a task was added keep their width
@@ -58,8 +58,8 @@ class GoalTable:
         for task in tasks:
             if task not in self.tasks:
                 raise ConfigError(
-                    f"the goal table {self.encoder} has no task {task!r}{_meant(task, self.tasks)}",
-                    f"use its tasks: {', '.join(self.tasks)}",
+                    f"the goal table {self.encoder} has no task '{task}'",
+                    f"{suggest(task, self.tasks)}its tasks: {', '.join(self.tasks)}",
                 )
         rows = [self.tasks.index(task) for task in tasks]
         return replace(
@@ -184,8 +184,3 @@ def _ablation(table: GoalTable) -> GoalTable:
 
 def _rows(prompts: np.ndarray) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(row) for row in prompts.tolist())
-
-
-def _meant(got: str, valid: Sequence[str]) -> str:
-    close = difflib.get_close_matches(got, valid, n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""

@@ -6,7 +6,6 @@ files byte for byte; what is not a function of config and seed is named `wall_s`
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.formats import format_figure
+from cmrl_jax.storage.documents import read_csv
 
 LEADING_COLUMNS = ("iteration", "env_steps", "gradient_steps", "wall_s", "seed")
 
@@ -82,10 +82,15 @@ class MetricsCsv:
 
 
 def read_rows(path: Path) -> Iterator[dict[str, float | None]]:
-    """The rows of a metrics.csv, oldest first; None where a figure was not taken."""
-    with open(path, encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            yield {name: float(text) if text else None for name, text in row.items()}
+    """The rows of a metrics.csv, oldest first; None where a figure was not taken.
+
+    Raises:
+        ConfigError: it cannot be read, or is no such file.
+    """
+    columns, rows = read_csv(path, "restore the file from a copy")
+    for row in rows.values():
+        pairs = zip(columns, row, strict=True)
+        yield {name: float(text) if text else None for name, text in pairs}
 
 
 def _check_resumable(path: Path, header: bytes, offset: int) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from envs.command_line import Parser, make_directory, run, typed_path
+from envs.figures import pyplot_for
 from envs.outputs import FORCE_HELP, check_output, replacing, written_by
 from envs.render.frames import choose_gl
 
@@ -25,18 +26,10 @@ def write_picture(scene: str, out: Path) -> None:
     Raises:
         ValueError: matplotlib is missing (two lines: cause, cure).
     """
-    try:
-        import matplotlib
+    pyplot = pyplot_for("a picture")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.patches import Patch
 
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.patches import Patch
-    except ImportError:
-        raise ValueError(
-            "the pictures' labels need matplotlib, which is not installed\n"
-            "pip install 'cmrl-jax[viz]'"
-        ) from None
     from envs.render.port_scene import COLORS
 
     tasks = (f"{scene}-open", f"{scene}-close")

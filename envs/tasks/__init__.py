@@ -7,8 +7,9 @@ the end.
 
 from __future__ import annotations
 
-import difflib
 from typing import NamedTuple
+
+from envs.command_line import suggest
 
 
 class Entry(NamedTuple):
@@ -43,7 +44,6 @@ def task_id(name: str) -> int:
         ValueError: unknown name; the message lists the valid ones.
     """
     if name not in TASKS:
-        close = difflib.get_close_matches(name, TASKS, 1)
-        hint = f"did you mean '{close[0]}'? " if close else ""
-        raise ValueError(f"unknown task '{name}'\n{hint}valid: {', '.join(TASKS)}")
+        valid = f"valid: {', '.join(TASKS)}"
+        raise ValueError(f"unknown task '{name}'\n{suggest(name, TASKS)}{valid}")
     return TASKS.index(name)

@@ -1,0 +1,25 @@
+"""matplotlib, which is an extra, asked for in one place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def pyplot_for(what: str) -> Any:
+    """matplotlib's pyplot, drawing to files alone.
+
+    Args:
+        what: needs it, in words.
+
+    Raises:
+        ValueError: it is not installed (two lines: cause, cure).
+    """
+    try:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+    except ImportError as error:
+        cause = f"{what} needs matplotlib, which is not installed"
+        raise ValueError(f"{cause}\npip install 'cmrl-jax[viz]'") from error
+    return pyplot
