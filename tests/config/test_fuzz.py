@@ -2,7 +2,7 @@
 
 That is everything before jax is imported: YAML documents against `config_io`, flags and paths
 against every command. 2,000 examples, the same each time, whose counts `pytest -s` prints. More of
-them, and others: `FUZZ=10 pytest tests/test_fuzz.py -s --hypothesis-seed 7`.
+them, and others: `FUZZ=10 pytest tests/config/test_fuzz.py -s --hypothesis-seed 7`.
 """
 
 import contextlib

@@ -30,7 +30,7 @@ from envs.render.picture import half_way
 from envs.tasks import TASKS
 from envs.tasks.specs import SPECS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SCENE = {task: spec.scene for task, spec in zip(TASKS, SPECS, strict=True)}
 FINGERS = ("rightclaw_it", "rightpad_geom", "leftclaw_it", "leftpad_geom")
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
+from learner_fixtures import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
 from cmrl_jax.algorithms.cmrl.diagnostics import CONTEXT_SIZES, make_diagnose
 from cmrl_jax.algorithms.common.replay import sample_transitions

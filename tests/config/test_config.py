@@ -22,7 +22,7 @@ from cmrl_jax.config.files import (
 )
 from cmrl_jax.config.schema import Config, ConfigError, leaves
 
-CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.yaml"))
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
 # YAML text, what the cause must say, what the cure must say.
 TRAPS = [

@@ -17,7 +17,7 @@ from cmrl_jax.config.schema import Config
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage import run_dir
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 NAMES = ["my run/a b", "it's", "$HOME", "a;b", "plain/run-1"]
 
 

@@ -27,7 +27,7 @@ from envs.goal_sets import load_goal_set
 from envs.parity.reference import record_rollout
 from envs.tasks import TASKS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 STEPS = 100  # the scripted policies have succeeded by then
 
 

@@ -173,7 +173,7 @@ def test_a_path_that_leads_nowhere_is_refused(mistake, here, command, flag, path
 @pytest.mark.parametrize(("command", "flag"), EVERY_PATH, ids=map(" ".join, EVERY_PATH))
 def test_a_path_through_a_file_is_refused(mistake, here, monkeypatch, command, flag):
     monkeypatch.setattr(picture, "choose_gl", lambda: None)
-    shutil.copy(Path(__file__).parent.parent / "results/pearl/metrics.csv", here / "r")
+    shutil.copy(Path(__file__).parents[2] / "results/pearl/metrics.csv", here / "r")
     path = "file/x.png" if flag == "--figure" else "file/x"
     cause, _ = mistake(command, words_of(command, flag, path))
     assert "file" in cause

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 LINE = '    "drawer-half": Entry("envs.tasks.drawer_half", "drawer-open", is_metaworlds=False),\n'
 FILE = '''"""The drawer, pulled half open."""
 

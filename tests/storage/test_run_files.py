@@ -17,7 +17,7 @@ from cmrl_jax.storage.run_files import (
     read_metrics,
 )
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

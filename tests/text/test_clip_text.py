@@ -21,7 +21,7 @@ from cmrl_jax.text.clip_text import Architecture
 from cmrl_jax.text.encoders import embed, find_encoder
 from cmrl_jax.text.goals import load_goals, read_table
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SMALL = ("gelu", "legacy-eos")
 
 

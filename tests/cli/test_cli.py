@@ -15,7 +15,7 @@ from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config, to_yaml
 from cmrl_jax.storage import run_dir
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

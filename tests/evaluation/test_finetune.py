@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_learner import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
+from learner_fixtures import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
 from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.common.replay import ContextBatch

@@ -17,7 +17,7 @@ from cmrl_jax.text.goal_files import table_path
 from cmrl_jax.text.goals import load_goals, read_table
 from envs.tasks import TASKS
 
-GOLDEN = Path(__file__).parent / "golden" / "tiny_bert.npz"
+GOLDEN = Path(__file__).parents[1] / "golden" / "tiny_bert.npz"
 
 
 def test_forward_pass_equals_torch():

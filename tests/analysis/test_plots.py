@@ -15,7 +15,7 @@ from cmrl_jax.cli.main import main
 from cmrl_jax.config.schema import ConfigError
 from envs.tasks import TASKS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 # One panel is drawn faster than four.
 ONE_TASK = {"tasks.train": "window-open", "tasks.test": "", "train.capacity": "2004"}
 OTHER = {"tasks.train": "drawer-close,window-open,window-close", "tasks.test": "drawer-open"}
