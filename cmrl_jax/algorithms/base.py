@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import jax
-import numpy as np
 from flax import struct
-
-Array = jax.Array | np.ndarray
 
 
 class Told(NamedTuple):
-    """What lanes are told of their task, any leading axes.
+    """What lanes are told of their task, numpy or jax arrays with any leading axes.
 
     Attributes:
         text: text vector (..., G).
@@ -27,9 +24,9 @@ class Told(NamedTuple):
             told which task it is.
     """
 
-    text: Array
-    text_mask: Array
-    task_row: Array
+    text: Any
+    text_mask: Any
+    task_row: Any
 
 
 class Agent(Protocol):
@@ -43,8 +40,11 @@ class Agent(Protocol):
         chunk: control steps that may pass between two calls of `observe`.
     """
 
-    adapts: bool
-    chunk: int
+    @property
+    def adapts(self) -> bool: ...
+
+    @property
+    def chunk(self) -> int: ...
 
     def init(self, told: Told) -> Any:
         """The memory of lanes that have seen nothing; `told` with any leading axes."""
@@ -61,7 +61,7 @@ class Agent(Protocol):
         ...
 
     def act(
-        self, params: Any, memory: Any, obs: Array, noise: Array, deterministic: Array | bool
+        self, params: Any, memory: Any, obs: jax.Array, noise: jax.Array, deterministic: Any
     ) -> jax.Array:
         """Actions (lane, act) in [-1, 1].
 
@@ -72,7 +72,7 @@ class Agent(Protocol):
         """
         ...
 
-    def observe(self, params: Any, memory: Any, transitions: Any, mask: Array) -> Any:
+    def observe(self, params: Any, memory: Any, transitions: Any, mask: jax.Array) -> Any:
         """The memory with transitions (lane, time, ...) added, oldest first, where the mask is 1.
 
         Args:

@@ -107,13 +107,13 @@ def load_goals(table: str, tasks: tuple[str, ...] | None = None) -> GoalTable:
 
 def _one_hot(tasks: tuple[str, ...] | None) -> GoalTable:
     beside = call_envs(lambda: tasks_beside(tasks[0] if tasks else METAWORLD_TASKS[0]))
-    tasks = tasks or beside[:ONE_HOT_WIDTH]
-    width = max(ONE_HOT_WIDTH, *(1 + beside.index(task) for task in tasks if task in beside))
+    named: tuple[str, ...] = tasks or beside[:ONE_HOT_WIDTH]
+    width = max(ONE_HOT_WIDTH, *(1 + beside.index(task) for task in named if task in beside))
     known = beside[:width]
     eye = np.eye(len(known), width, dtype=np.float32)[:, None, :]  # (task, 1, G)
     names = tuple((task,) for task in known)
     table = GoalTable(known, eye, eye, names, names, encoder="one-hot", revision="", sha256="")
-    return _ablation(table).select(tasks)
+    return _ablation(table).select(named)
 
 
 def check_same_table(table: GoalTable, recorded_sha256: str, run: Path, cure: str = "") -> None:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from cmrl_jax.algorithms.base import Array, RunState, Told
+from cmrl_jax.algorithms.base import RunState, Told
 from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.nn.context import Belief, init_belief
@@ -42,9 +42,9 @@ class Memory:
     """
 
     belief: Belief | None
-    text: Array
-    text_mask: Array
-    conditioning: Array
+    text: jax.Array
+    text_mask: jax.Array
+    conditioning: jax.Array
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,12 @@ class CmrlAgent:
         )
 
     def act(
-        self, params: PolicyParams, memory: Memory, obs: Array, noise: Array, deterministic: Any
+        self,
+        params: PolicyParams,
+        memory: Memory,
+        obs: jax.Array,
+        noise: jax.Array,
+        deterministic: Any,
     ) -> jax.Array:
         action, _ = self.learner.policy(
             params.actor_params,
@@ -101,7 +106,7 @@ class CmrlAgent:
         return action
 
     def observe(
-        self, params: PolicyParams, memory: Memory, transitions: Transition, mask: Array
+        self, params: PolicyParams, memory: Memory, transitions: Transition, mask: jax.Array
     ) -> Memory:
         inference = self.learner.inference
         if inference is None:

@@ -150,6 +150,7 @@ class Learner:
         shown = self.normalize_obs(obs_stats, obs)
         mean, log_std, routing = self.networks.actor(actor_params, shown, zc)
         if noise is None:
+            assert key is not None
             noise = jax.random.normal(key, mean.shape)
         action, _ = sample_tanh_gaussian(mean, log_std, noise)
         return jnp.where(deterministic, jnp.tanh(mean), action), routing
