@@ -99,6 +99,15 @@ def environment(name: str) -> Environment:
     return _found(ENVIRONMENTS, name, "environment")
 
 
+def algorithm(name: str) -> AlgorithmEntry:
+    """The entry of an algorithm.
+
+    Raises:
+        ValueError: unknown (two lines: cause, cure).
+    """
+    return _found(ALGORITHMS, name, "algorithm")
+
+
 def make_environment(options: Any) -> Any:
     """Builds what the `env` section of a configuration names: a `MetaEnv`."""
     return _loaded(environment(options.name).make)(options)
@@ -106,8 +115,7 @@ def make_environment(options: Any) -> Any:
 
 def make_algorithm(config: Any, env: Any, goal_vectors: Any) -> Any:
     """Builds what a configuration names: an `Algorithm`."""
-    entry = _found(ALGORITHMS, config.algorithm, "algorithm")
-    return _loaded(entry.make)(config, env, goal_vectors)
+    return _loaded(algorithm(config.algorithm).make)(config, env, goal_vectors)
 
 
 def rules_of(config: Any) -> Any:
@@ -116,7 +124,7 @@ def rules_of(config: Any) -> Any:
     Raises:
         ValueError: unknown algorithm (two lines: cause, cure).
     """
-    return _loaded(_found(ALGORITHMS, config.algorithm, "algorithm").rules)(config)
+    return _loaded(algorithm(config.algorithm).rules)(config)
 
 
 def task_names() -> tuple[str, ...]:

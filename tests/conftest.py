@@ -32,6 +32,20 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture
+def monkeypatch(monkeypatch):
+    """pytest's own; what it patches may be traced, so compiled programs are not shared with it."""
+
+    def forget():
+        if session := sys.modules.get("cmrl_jax.evaluation.session"):
+            session.forget_programs()
+
+    right = monkeypatch.setattr
+    monkeypatch.setattr = lambda *args, **options: (forget(), right(*args, **options))[1]
+    yield monkeypatch
+    forget()
+
+
+@pytest.fixture
 def refused(capsys):
     """Runs the command line on a user's mistake; returns its one line of cause and one of cure."""
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from cmrl_jax.commands import CHILD
 from cmrl_jax.evaluation.cells import CellTable
-from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.evaluation.options import EvalOptions
 from cmrl_jax.evaluation.scores import cell_rows, of_policy
 from cmrl_jax.evaluation.session import Session
@@ -62,7 +61,7 @@ def time_one_by_one(
         for target in targets
         for task in target.tasks
     }
-    evaluator = Evaluator(session.config, session.env, session.agent, 1, options.horizon)
+    evaluator = session.evaluator(1, options.horizon)
     started = time.monotonic()
     evaluator.compile(policies[targets[0]].params, next(iter(trials.values())).texts.shape[-1])
     compiled, worked = time.monotonic(), time.process_time()

@@ -8,7 +8,6 @@ from typing import Any
 
 from cmrl_jax.config.schema import Config, call_envs
 from cmrl_jax.evaluation.cells import Row
-from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks
 from cmrl_jax.evaluation.scores import cell_rows, format_scores, of_policy, summarise
 from cmrl_jax.evaluation.session import Policy, Session
@@ -77,7 +76,7 @@ def score(run: Path, session: Session, policy: Policy, options: EvalOptions) -> 
     trial = trial_of([policy], session, options, tasks)
     unit = config.eval.goals * len(session.eval_tasks)
     lanes = batch_lanes(len(tasks) * options.goals * options.draws, unit, lane_budget(options))
-    evaluator = Evaluator(config, session.env, session.agent, lanes, options.horizon)
+    evaluator = session.evaluator(lanes, options.horizon)
     k = options.k if options.k is not None else config.eval.final_k
     scores = of_policy(evaluator.run([policy.params], trial, k, options.seed), 0)
     return Evaluation(

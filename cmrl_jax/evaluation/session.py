@@ -6,8 +6,9 @@ Shared by training, evaluation and benchmarks.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmrl_jax.algorithms.base import Agent, Algorithm
+from cmrl_jax import parallel
+from cmrl_jax.algorithms.base import Agent, Algorithm, RunState
 from cmrl_jax.config.schema import Config, call_envs
 from cmrl_jax.evaluation.controls import text_per_goal
 from cmrl_jax.evaluation.evaluator import Evaluator, Trial
-from cmrl_jax.jax_runtime import cache_directory, check_switches, first_device
-from cmrl_jax.registry import make_algorithm, make_environment
+from cmrl_jax.jax_runtime import cache_directory, check_switches, first_device, jit_once
+from cmrl_jax.registry import algorithm, environment, make_algorithm, make_environment
 from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
 from cmrl_jax.text.goals import GoalTable, load_goals
@@ -48,6 +50,96 @@ def prepare_jax(config: Config) -> str:
     return f"{device.platform} ({device.device_kind}), {jax.device_count()} device(s)"
 
 
+class TrainingProgram:
+    """The two programs of training: its first state, and an iteration, which takes a state's place.
+
+    Attributes:
+        abstract: shapes of the state, placed on the devices.
+        init: key -> RunState.
+        metrics: shapes of an iteration's metrics.
+    """
+
+    def __init__(self, algorithm: Algorithm, goals: jax.Array | None, mesh: Any):
+        shapes = jax.eval_shape(algorithm.init, jax.random.key(0))
+        self.abstract = parallel.placed(shapes, mesh)
+        places = jax.tree.map(lambda leaf: leaf.sharding, self.abstract)
+        # A program of its own, so that every leaf has a buffer: the iteration donates them all.
+        self.init = jit_once(algorithm.init, out_shardings=places)
+        iteration = algorithm.make_iteration(goals)
+        with parallel.using(mesh):
+            # Traced once, for the columns and for the program: tracing the physics takes seconds.
+            program = jax.jit(iteration, donate_argnums=0, out_shardings=(places, None))
+            self._traced = program.trace(self.abstract)
+        self.metrics = self._traced.out_info[1]
+        self._compiled: Any = None
+
+    @property
+    def is_compiled(self) -> bool:
+        return self._compiled is not None
+
+    def compile(self) -> Callable[[RunState], tuple[RunState, dict[str, jax.Array]]]:
+        """The compiled iteration; later calls do not compile."""
+        if self._compiled is None:
+            self._compiled = self._traced.lower().compile()
+        return self._compiled
+
+
+class Parts:
+    """What a configuration's programs are made of, and the programs themselves.
+
+    Kept from one `Session` to the next where nothing that shapes them differs, so that a process
+    that trains or evaluates again does not trace the physics again.
+    """
+
+    def __init__(self, config: Config, train_goals: jax.Array):
+        self.env: MetaEnv = call_envs(lambda: make_environment(config.env))
+        self.algorithm: Algorithm = call_envs(lambda: make_algorithm(config, self.env, train_goals))
+        self.evaluators: dict[Any, Evaluator] = {}
+        self.training: dict[Any, Any] = {}
+
+
+_KEPT = 4  # configurations; a compiled program is some hundred megabytes
+_parts: OrderedDict[Any, Parts] = OrderedDict()
+
+
+def _parts_of(config: Config, goals: GoalTable, train_goals: jax.Array) -> Parts:
+    key = (
+        _shaping(config),
+        goals.sha256,
+        id(environment(config.env.name)),
+        id(algorithm(config.algorithm)),
+        jax.config.jax_debug_nans,
+        jax.config.jax_debug_infs,
+    )
+    if key not in _parts:
+        _parts[key] = Parts(config, train_goals)
+    _parts.move_to_end(key)
+    while len(_parts) > _KEPT:
+        _parts.popitem(last=False)
+    return _parts[key]
+
+
+def _shaping(config: Config) -> Config:
+    """A configuration with what no program depends on at its default."""
+    usual = Config()
+    length = replace(config.train, env_steps=usual.train.env_steps, minutes=usual.train.minutes)
+    return replace(
+        config,
+        name=usual.name,
+        seed=usual.seed,
+        train=length,
+        eval=usual.eval,
+        checkpoint=usual.checkpoint,
+        log=usual.log,
+        runtime=replace(config.runtime, compile_cache=usual.runtime.compile_cache),
+    )
+
+
+def forget_programs() -> None:
+    """Lets go of all that was kept for later sessions: their memory, and code that has changed."""
+    _parts.clear()
+
+
 class Session:
     """Environment, goal vectors and algorithm of one configuration.
 
@@ -59,11 +151,9 @@ class Session:
         self.config = config
         self.eval_tasks = config.tasks.train + config.tasks.test
         self.goals: GoalTable = load_goals(config.goals.table, self.eval_tasks)
-        self.env: MetaEnv = call_envs(lambda: make_environment(config.env))
         self.train_goals = jnp.asarray(self.goals.select(config.tasks.train).vectors)
-        self.algorithm: Algorithm = call_envs(
-            lambda: make_algorithm(config, self.env, self.train_goals)
-        )
+        self._parts = _parts_of(config, self.goals, self.train_goals)
+        self.env, self.algorithm = self._parts.env, self._parts.algorithm
 
     @property
     def agent(self) -> Agent:
@@ -87,14 +177,32 @@ class Session:
         texts = text_per_goal(list(self.goals.vectors[:, :1]), goals)
         return Trial(self.eval_tasks, self.placements(goal_set, goals), texts[None])
 
-    def evaluator(self) -> Evaluator:
-        """The evaluator of a training run; a batch of it is one periodic evaluation."""
-        return Evaluator(
-            self.config,
-            self.env,
-            self.agent,
-            lanes=self.config.eval.goals * len(self.eval_tasks),
-        )
+    def evaluator(
+        self, lanes: int | None = None, horizon: int | None = None, policies: int = 1
+    ) -> Evaluator:
+        """An evaluator; with a program that an earlier one of its kind has compiled.
+
+        Args:
+            lanes: of a batch; by default those of a periodic evaluation of training.
+            horizon: control steps an episode; the run's own by default.
+            policies: scored side by side.
+        """
+        lanes = lanes or self.config.eval.goals * len(self.eval_tasks)
+        kind = lanes, horizon or self.config.env.horizon, policies
+        kept = self._parts.evaluators
+        if self.env is not self._parts.env or kind not in kept:
+            made = Evaluator(self.config, self.env, self.agent, lanes, horizon, policies)
+            if self.env is not self._parts.env:
+                return made
+            kept[kind] = made
+        return kept[kind]
+
+    def training(self, mesh: Any) -> TrainingProgram:
+        """The training iteration over a mesh of devices, traced and not yet compiled."""
+        kept = self._parts.training
+        if mesh not in kept:
+            kept[mesh] = TrainingProgram(self.algorithm, self.train_placements(), mesh)
+        return kept[mesh]
 
 
 @dataclass(frozen=True)

@@ -160,14 +160,7 @@ def compiled_evaluator(
     started = time.monotonic()
     while True:
         print(f"compiling {plan.policies} x {plan.lanes} lanes ...", flush=True)
-        evaluator = Evaluator(
-            session.config,
-            session.env,
-            session.agent,
-            plan.lanes,
-            options.horizon,
-            policies=plan.policies,
-        )
+        evaluator = session.evaluator(plan.lanes, options.horizon, plan.policies)
         evaluator.compile(policy.params, width)
         smaller = fitted(plan, evaluator.memory_bytes(), memory_limit())
         if smaller == plan:

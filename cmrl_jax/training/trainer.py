@@ -22,7 +22,6 @@ from cmrl_jax.algorithms.base import RunState
 from cmrl_jax.config.schema import Config, ConfigError, lanes_per_task
 from cmrl_jax.evaluation.scores import fault_warning, format_scores, of_policy, summarise
 from cmrl_jax.evaluation.session import Session, prepare_jax
-from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.registry import rules_of
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.checkpoint import full_store, join_run, policy_store, split_run
@@ -142,23 +141,14 @@ class _Run:
 
     def train(self, device: str, resume: bool) -> Outcome:
         self.say(f"device: {device}")
-        mesh = parallel.make_mesh()
-        iteration = self.algorithm.make_iteration(self.session.train_placements())
-        init = self.algorithm.init
-        abstract = parallel.placed(jax.eval_shape(init, jax.random.key(0)), mesh)
-        places = jax.tree.map(lambda leaf: leaf.sharding, abstract)
-        # Jitted, so that every leaf has a buffer of its own: the iteration donates them all.
-        self.init = jit_once(init, out_shardings=places)
-        with parallel.using(mesh):
-            # Traced once, for the columns and for the program: tracing the physics takes seconds.
-            program = jax.jit(iteration, donate_argnums=0, out_shardings=(places, None))
-            traced = program.trace(abstract)
-        self.start(abstract, self.columns(traced.out_info[1]), resume)
+        program = self.session.training(parallel.make_mesh())
+        self.init = program.init
+        self.start(program.abstract, self.columns(program.metrics), resume)
         try:
             if self.iterations_left() and not self.stop.requested:
-                self.iteration = self.timed(
-                    "the training iteration", lambda: traced.lower().compile()
-                )
+                if not program.is_compiled:
+                    self.timed("the training iteration", program.compile)
+                self.iteration = program.compile()
             while self.iterations_left() and not self.stop.requested:
                 self.step()
             self.save()

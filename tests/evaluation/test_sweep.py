@@ -17,7 +17,7 @@ from cmrl_jax.cli.main import main
 from cmrl_jax.evaluation import sweep as sweep_module
 from cmrl_jax.evaluation.cells import CellTable
 from cmrl_jax.evaluation.evaluator import Evaluator
-from cmrl_jax.evaluation.session import Session
+from cmrl_jax.evaluation.session import Session, forget_programs
 from cmrl_jax.evaluation.sweep import INTERRUPTED
 from cmrl_jax.evaluation.targets import targets_of
 from envs.physics.native import NativePhysics
@@ -49,6 +49,7 @@ def swept(runs):
             compile_(self, params, width)
             memory.append((self.policies * self.lanes, memory_bytes(self)))
 
+    forget_programs()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Evaluator, "compile", recorded)
         assert sweep(runs, runs / "s.csv", "--json", str(runs / "s.json")) == 0

@@ -19,7 +19,7 @@ from run_helpers import ROOT, assert_same_result, native, rows_of, run_and_signa
 from cmrl_jax.algorithms.cmrl.rules import lane_groups
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config
-from cmrl_jax.evaluation.session import Session, load_policy
+from cmrl_jax.evaluation.session import Session, forget_programs, load_policy
 from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.storage.checkpoint import full_store
 from cmrl_jax.text import goal_files
@@ -30,6 +30,7 @@ def finished(tmp_path_factory):
     """A finished smoke run, and the number of programs that were compiled ahead of time."""
     run = tmp_path_factory.mktemp("train") / "run"
     compiles = []
+    forget_programs()
     with pytest.MonkeyPatch.context() as patch:
         original = jax.stages.Lowered.compile
 
