@@ -51,6 +51,8 @@ class MetaEnv(Protocol):
         goal_size: numbers of a goal (where the target is, say), which an episode is reset to.
         tasks: names; a task's place is its id.
         can_terminate: whether a step may end an episode for good.
+        symmetries: signs of observations (symmetry, observation_size) and of actions (symmetry,
+            action_size): each a mirror in which the scene could be as well, the identity first.
     """
 
     observation_size: int
@@ -58,6 +60,9 @@ class MetaEnv(Protocol):
     goal_size: int
     tasks: tuple[str, ...]
     can_terminate: bool
+
+    @property
+    def symmetries(self) -> tuple[np.ndarray, np.ndarray]: ...
 
     def reset(self, key: jax.Array, task_id: jax.Array, /) -> Any:
         """A fresh episode of a task on a random goal: MetaState."""

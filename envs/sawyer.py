@@ -178,6 +178,24 @@ class Ml4Env:
             steps=state.steps + 1,
         )
 
+    @property
+    def symmetries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Planar mirrors about the object's place: none, x, y, both.
+
+        Only canonical observations have their origin there; others have the identity alone.
+        """
+        mirrors = [(1, 1), (-1, 1), (1, -1), (-1, -1)]
+        if self.obs_mode != "canonical":
+            mirrors = mirrors[:1]
+        of_obs = np.ones((len(mirrors), OBS_SIZE), np.float32)
+        of_action = np.ones((len(mirrors), ACTION_SIZE), np.float32)
+        places = [start + part.start for start in (0, FRAME) for part in (HAND, OBJECT)]
+        for row, signs in enumerate(mirrors):
+            of_action[row, :2] = signs
+            for place in (*places, 2 * FRAME):
+                of_obs[row, place : place + 2] = signs
+        return of_obs, of_action
+
     def goals(self, name: str, tasks: Sequence[str] = TASKS) -> np.ndarray:
         """Placements of a named goal set, see `goal_sets.load_goal_set`."""
         return load_goal_set(name, tasks)

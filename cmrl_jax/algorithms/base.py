@@ -37,11 +37,15 @@ class Agent(Protocol):
 
     Attributes:
         adapts: whether experience changes what it does.
+        explores: whether an episode that it learns from differs from one that counts.
         chunk: control steps that may pass between two calls of `observe`.
     """
 
     @property
     def adapts(self) -> bool: ...
+
+    @property
+    def explores(self) -> bool: ...
 
     @property
     def chunk(self) -> int: ...
@@ -50,13 +54,16 @@ class Agent(Protocol):
         """The memory of lanes that have seen nothing; `told` with any leading axes."""
         ...
 
-    def begin_episode(self, params: Any, memory: Any, source: Any, keys: jax.Array) -> Any:
+    def begin_episode(
+        self, params: Any, memory: Any, source: Any, keys: jax.Array, exploit: jax.Array
+    ) -> Any:
         """The memory for an episode that begins.
 
         Args:
             source: the memory that the episode is acted on; each lane's own, but in an
                 evaluation's controls, which give it another's or one without experience.
             keys: (lane,) keys of what the agent draws for an episode.
+            exploit: () bool, whether the episode counts: it is to go well, and is not learned from.
         """
         ...
 
@@ -114,6 +121,7 @@ class Algorithm:
             metrics. Metrics are float32, () or one value a training task (task,).
         policy_params: RunState -> the parameters that the agent acts with, saved as a policy.
         gradient_steps: RunState -> () int32, gradient steps applied.
+        searching: an agent that adapts by search, where the algorithm has one.
         parts: the algorithm's own, for what inspects or fine-tunes it.
     """
 
@@ -122,4 +130,5 @@ class Algorithm:
     make_iteration: Callable[[jax.Array | None], TrainIteration]
     policy_params: Callable[[RunState], Any]
     gradient_steps: Callable[[RunState], jax.Array]
+    searching: Agent | None = None
     parts: Any = None

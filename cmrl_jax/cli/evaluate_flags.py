@@ -67,6 +67,22 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         "--policy", default=kinds[0], metavar="P", choices=kinds, help=f"or {kinds[1]} [{kinds[0]}]"
     )
     add("--lanes", type=whole(1), metavar="N", help="parallel episodes in a batch [by device]")
+    add(
+        "--adapt",
+        default="posterior",
+        metavar="A",
+        choices=("posterior", "search"),
+        help="what own episodes change: posterior: the belief over z; search: which z and which "
+        "mirror of the scene is acted on [posterior]",
+    )
+    add(
+        "--protocol",
+        default="goal",
+        metavar="P",
+        choices=("goal", "task"),
+        help="goal: adapt to each goal by itself; task: each of --eval-seeds runs adapts once, on "
+        "goals of the train set, and is scored on all goals [goal]",
+    )
     controls = parser.add_argument_group("controls: is z used, is the text?")
     add = controls.add_argument
     add(

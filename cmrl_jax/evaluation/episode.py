@@ -71,20 +71,20 @@ def make_episode(env: MetaEnv, agent: Agent, horizon: int) -> EpisodeFn:
     """Builds one evaluation episode of every lane of every policy, a jittable function.
 
     Returns:
-        (params, memory, source, lanes, deterministic, key) -> memory with the episode observed,
-        Episode of (policy, lane). params, memory and source have a leading policy axis;
-        `deterministic` is () bool.
+        (params, memory, source, lanes, deterministic, exploit, key) -> memory with the episode
+        observed, Episode of (policy, lane). params, memory and source have a leading policy axis;
+        `deterministic` and `exploit` (see `Agent.begin_episode`) are () bool.
     """
 
-    def episode(params, memory, source, lanes: Lanes, deterministic, key):
+    def episode(params, memory, source, lanes: Lanes, deterministic, exploit, key):
         policies, per_policy = jax.tree.leaves(memory)[0].shape[:2]
         flat = lambda x: x.reshape(policies * per_policy, *x.shape[2:])
         by_policy = lambda x: x.reshape(policies, per_policy, *x.shape[1:])
         every = lambda x: flat(jnp.broadcast_to(x, (policies, *x.shape)))
         action_keys = chunk_keys(agent.chunk, key, horizon)
         chunk = horizon // len(action_keys)
-        begin = jax.vmap(agent.begin_episode, in_axes=(0, 0, 0, None))
-        memory = begin(params, memory, source, agent_keys(key, lanes.lane_id))
+        begin = jax.vmap(agent.begin_episode, in_axes=(0, 0, 0, None, None))
+        memory = begin(params, memory, source, agent_keys(key, lanes.lane_id), exploit)
 
         def lane_noise(key):
             """Noise of a chunk's actions (time, lane, act), each lane's its own."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ from cmrl_jax.evaluation.options import MOST_DRAWS, ZSource
 from envs.base import MetaEnv
 
 GOAL_IDS = 1000  # more than the goals of any set
+LEARNER = 500  # goal by which a lane's noise is named that learns for all goals of its task
 TASK_IDS = 4  # tasks whose lanes are numbered side by side
 
 
@@ -41,6 +42,8 @@ class Trial:
         first_goal: number of the first goal, by which its lanes' noise is named.
         draws: z draws a goal.
         z: what episodes are acted on, see `controls.sources`.
+        adaptation: goals that are learned on (task, draw, episode, goal_size), where a draw of a
+            task learns once for all its goals; None where each goal is adapted to by itself.
         deterministic: whether actions are the tanh of the mean.
     """
 
@@ -51,6 +54,12 @@ class Trial:
     draws: int = 1
     z: ZSource = "posterior"
     deterministic: bool = True
+    adaptation: np.ndarray | None = None
+
+    def learners(self) -> Trial:
+        """One lane for each task and draw, which learns for all goals of the task."""
+        first = replace(self, placements=self.placements[:, :1], texts=self.texts[:, :, :1])
+        return replace(first, first_goal=self.first_goal + LEARNER)
 
     def of_goal(self, goal: int) -> Trial:
         """One goal of every task, with the noise that it has among the others."""
@@ -60,6 +69,14 @@ class Trial:
             texts=self.texts[:, :, goal : goal + 1],
             first_goal=self.first_goal + goal,
         )
+
+
+class _Stage(NamedTuple):
+    """What is the same for all episodes of an evaluation."""
+
+    params: Any
+    deterministic: np.bool_
+    check: Callable[[], None]
 
 
 class Evaluator:
@@ -102,9 +119,8 @@ class Evaluator:
         memory = self._blank(Told(text, ones, np.zeros(shape, np.int32)))
         lanes = Lanes(zero, zero, np.zeros((self.lanes, self._env.goal_size), np.float32))
         stacked = _stack([params] * self.policies)
-        return self._episode.trace(
-            stacked, memory, memory, lanes, np.bool_(True), jax.random.key(0)
-        )
+        yes = np.bool_(True)
+        return self._episode.trace(stacked, memory, memory, lanes, yes, yes, jax.random.key(0))
 
     def memory_bytes(self) -> int:
         """Memory that the compiled episode needs beside its arguments, in bytes; 0: unknown."""
@@ -125,10 +141,8 @@ class Evaluator:
             k -> Episode of numpy arrays (policy, task, goal, draw). Its faults are those of the
             adaptation episodes, too.
         """
-        scores, faults = [], 0
-        for _, score in self.episodes(policies, trial, max(k) + 1, seed, check):
-            faults = faults + score.faults
-            scores.append(score._replace(faults=faults))
+        counted = self.episodes(policies, trial, max(k) + 1, seed, check, k)
+        scores = {n: score for n, _, score in counted}
         return {n: scores[n] for n in k}
 
     def episodes(
@@ -138,60 +152,108 @@ class Evaluator:
         count: int,
         seed: int,
         check: Callable[[], None] = lambda: None,
-    ) -> Iterator[tuple[Any, Episode]]:
-        """Plays `count` episodes of every adaptation run, each from what those before it showed.
+        counted: Sequence[int] | None = None,
+    ) -> Iterator[tuple[int, Any, Episode]]:
+        """Plays adaptation runs of `count` episodes, each acted on what those before it showed.
+
+        An agent that does not explore learns from the episodes that count, where those are on its
+        own goal; else an episode that counts is one more, which nothing is learned from.
 
         Args:
             policies: at most as many as the evaluator has place for.
             seed: seed of the draws; a draw depends on it, task, goal, draw and episode alone.
             check: is called before each batch; what it raises ends the evaluation.
+            counted: episodes to score; all by default.
 
         Yields:
-            For each episode the memories of all lanes before it, numpy (policy, lane, ...), and
-            its Episode of numpy arrays (policy, task, goal, draw).
+            For each counted episode its number, the memories of all lanes before it, numpy
+            (policy, lane, ...), and its Episode of numpy arrays (policy, task, goal, draw).
         """
         self.compile(policies[0], trial.texts.shape[-1])
-        params = _stack([*policies, *[policies[-1]] * (self.policies - len(policies))])
-        shape = (len(policies), *trial.placements.shape[:2], trial.draws)
+        stage = _Stage(
+            params=_stack([*policies, *[policies[-1]] * (self.policies - len(policies))]),
+            deterministic=np.bool_(trial.deterministic),
+            check=check,
+        )
         lanes, told = self.lanes_of(trial), self.told_of(trial)
-        total = len(lanes.lane_id)
         source_of = sources(trial.z, lanes, told, self._blank)
-        memories = self._blank(told)
-        key = jax.random.key(seed)
+        learners = trial if trial.adaptation is None else trial.learners()
+        heirs = _heirs(trial)  # the learning lane of each lane that counts
+        memories = self._blank(self.told_of(learners))
+        faults = np.zeros((self.policies, len(self.lanes_of(learners).lane_id)), np.int32)
+        is_apart = trial.adaptation is not None or self._agent.explores
         for episode in range(count):
-            # Every batch acts on what was known before the episode, its donors' lanes too.
-            before = jax.tree.map(np.copy, memories)
-            parts = []
-            for start in range(0, total, self.lanes):
-                check()
-                index = np.minimum(np.arange(start, start + self.lanes), total - 1)
-                memory, part = self._compiled(
-                    params,
-                    jax.tree.map(lambda x: x[:, index], before),
-                    source_of(before, index),
-                    Lanes(*(x[index] for x in lanes)),
-                    np.bool_(trial.deterministic),
-                    jax.random.fold_in(key, episode),
+            key = jax.random.fold_in(jax.random.key(seed), episode)
+            known, before = _lanes(memories, heirs), faults[:, heirs]
+            is_counted = counted is None or episode in counted
+            if not is_apart:
+                memories, score = self._play(stage, known, source_of, lanes, False, key)
+                faults = faults + score.faults
+            elif is_counted:
+                _, score = self._play(stage, known, source_of, lanes, True, key)
+            if is_counted:
+                score = score._replace(faults=before + score.faults)
+                shape = (len(policies), *trial.placements.shape[:2], trial.draws)
+                own = lambda x: x[: shape[0]]
+                yield (
+                    episode,
+                    jax.tree.map(own, known),
+                    jax.tree.map(lambda x: own(x).reshape(shape), score),
                 )
-                valid = min(self.lanes, total - start)
-                for every, new in zip(*map(jax.tree.leaves, (memories, memory)), strict=True):
-                    every[:, start : start + valid] = np.asarray(new)[:, :valid]
-                parts.append(jax.tree.map(np.asarray, part))
-            joined = jax.tree.map(lambda *x: np.concatenate(x, 1)[:, :total], *parts)
-            known = jax.tree.map(lambda x: x[: shape[0]], before)
-            yield known, jax.tree.map(lambda x: x[: shape[0]].reshape(shape), joined)
+            if is_apart and episode + 1 < count:
+                places = self.lanes_of(learners, episode)
+                memories, learned = self._play(stage, memories, _lanes, places, False, key)
+                faults = faults + learned.faults
+
+    def _play(
+        self,
+        stage: _Stage,
+        memories: Any,
+        source_of: Callable[[Any, np.ndarray], Any],
+        lanes: Lanes,
+        exploit: bool,
+        key: jax.Array,
+    ) -> tuple[Any, Episode]:
+        """One episode of all lanes, batch after batch: memories after it, scores (policy, lane)."""
+        total, parts = len(lanes.lane_id), []
+        after = jax.tree.map(np.copy, memories)
+        for start in range(0, total, self.lanes):
+            stage.check()
+            index = np.minimum(np.arange(start, start + self.lanes), total - 1)
+            # Every batch acts on what was known before the episode, its donors' lanes too.
+            memory, part = self._compiled(
+                stage.params,
+                _lanes(memories, index),
+                source_of(memories, index),
+                Lanes(*(x[index] for x in lanes)),
+                stage.deterministic,
+                np.bool_(exploit),
+                key,
+            )
+            valid = min(self.lanes, total - start)
+            for every, new in zip(*map(jax.tree.leaves, (after, memory)), strict=True):
+                every[:, start : start + valid] = np.asarray(new)[:, :valid]
+            parts.append(jax.tree.map(np.asarray, part))
+        return after, jax.tree.map(lambda *x: np.concatenate(x, 1)[:, :total], *parts)
 
     def _blank(self, told: Told) -> Any:
         """Memories of lanes that have seen nothing, numpy (policy, lane, ...)."""
         return jax.tree.map(np.array, self._agent.init(told))
 
-    def lanes_of(self, trial: Trial) -> Lanes:
-        """All lanes of a trial, in the order task, goal, draw."""
-        task, goal, _ = _indices(trial)
+    def lanes_of(self, trial: Trial, episode: int | None = None) -> Lanes:
+        """All lanes of a trial, in the order task, goal, draw.
+
+        Args:
+            episode: of `trial.adaptation`, whose goals the lanes then are on, if it has any.
+        """
+        task, goal, draw = _indices(trial)
+        places = np.asarray(trial.placements, np.float32)[task, goal]
+        if episode is not None and trial.adaptation is not None:
+            places = np.asarray(trial.adaptation, np.float32)[task, draw, episode]
         return Lanes(
             env_task=self._task_ids(trial)[task],
             lane_id=lane_names(trial, self._env.tasks),
-            goal=np.asarray(trial.placements, np.float32)[task, goal],
+            goal=places,
         )
 
     def told_of(self, trial: Trial) -> Told:
@@ -220,6 +282,17 @@ def lane_names(trial: Trial, tasks: Sequence[str]) -> np.ndarray:
     block, within = place // TASK_IDS, place % TASK_IDS
     name = (block * np.int32(MOST_DRAWS) + draw) * np.int32(TASK_IDS) + within
     return name * np.int32(GOAL_IDS) + (goal + np.int32(trial.first_goal))
+
+
+def _heirs(trial: Trial) -> np.ndarray:
+    """For each lane the one that learns for it (lane,): itself, or its task's of the same draw."""
+    task, _, draw = _indices(trial)
+    return np.arange(len(task)) if trial.adaptation is None else task * trial.draws + draw
+
+
+def _lanes(memories: Any, index: np.ndarray) -> Any:
+    """Memories (policy, lane, ...) of some lanes."""
+    return jax.tree.map(lambda x: x[:, index], memories)
 
 
 def _indices(trial: Trial) -> np.ndarray:

@@ -290,6 +290,7 @@ class FineTuning:
             memory,
             Lanes(row + task, np.arange(goals, dtype=np.int32), placements),
             np.bool_(True),
+            np.bool_(True),
             jax.random.key(seed),
         )
         skipped = int(state.skipped_updates)

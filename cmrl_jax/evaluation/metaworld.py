@@ -69,7 +69,10 @@ def evaluate_in_metaworld(
     for row, task in enumerate(tasks):
         started = time.monotonic()
         alone = of_task(trial, row)
-        parts.append(k_shot(session, policy, alone, k, horizon, options.seed, options.lanes))
+        found = k_shot(
+            session, policy, alone, k, horizon, options.seed, options.lanes, options.adapt
+        )
+        parts.append(found)
         own[task] = metaworlds_own(session, policy, alone, options, horizon)
         seconds = format_duration(time.monotonic() - started)
         print(
@@ -106,6 +109,7 @@ def k_shot(
     horizon: int,
     seed: int,
     environments: int | None = None,
+    adapt: str = "posterior",
 ) -> dict[int, Episode]:
     """Our protocol on a trial of one task: k -> Episode of (1, goal, draw).
 
@@ -113,6 +117,7 @@ def k_shot(
 
     Args:
         environments: side by side; None for `ENVIRONMENTS`.
+        adapt: see `EvalOptions`.
     """
     [task] = trial.tasks
     goals, draws = trial.placements.shape[1], trial.draws
@@ -128,13 +133,12 @@ def k_shot(
             np.minimum(np.arange(start, start + lanes), len(goal) - 1)
             for start in range(0, len(goal), lanes)
         ]
-        agent = agent_of(session, policy, trial, batches, horizon, seed)
+        agent = agent_of(session, policy, trial, batches, horizon, seed, adapt)
         for index in batches:
             set_goals(envs, task, placements[index], shown)
             agent.init()
-            for number, episode in enumerate(adaptation_run(agent, envs, max(k) + 1, horizon)):
-                if number in parts:
-                    parts[number].append(episode)
+            for number, episode in adaptation_run(agent, envs, k, horizon).items():
+                parts[number].append(episode)
     finally:
         envs.close()
     shape = (1, goals, draws)
@@ -149,6 +153,7 @@ def agent_of(
     runs: Sequence[np.ndarray],
     horizon: int,
     seed: int,
+    adapt: str = "posterior",
 ) -> MetaWorldAgent:
     """The agent of a trial of one task, whose adaptation runs take these lanes of it in turn."""
     names, train = lane_names(trial, session.env.tasks), session.config.tasks.train
@@ -157,7 +162,7 @@ def agent_of(
     texts = np.repeat(trial.texts[0, 0], trial.draws, axis=0)  # (lane, G)
     return MetaWorldAgent(
         session.config.env,
-        session.agent,
+        session.agent_of(adapt),
         policy.params,
         texts=np.stack([texts[lanes] for lanes in runs]),
         lane_ids=np.stack([names[lanes] for lanes in runs]),
@@ -187,35 +192,50 @@ def format_own(own: dict[str, Any]) -> str:
 
 
 def adaptation_run(
-    agent: MetaWorldAgent, envs: SyncVectorEnv, episodes: int, horizon: int
-) -> list[Episode]:
-    """Episodes of full length, one after the other; scores of (lane,)."""
-    found = []
-    obs, _ = envs.reset()
-    for _ in range(episodes):
-        rewards, successes, distance = [], [], np.zeros(envs.num_envs)
-        for _ in range(horizon):
-            actions, aux = agent.adapt_action(obs)
-            next_obs, reward, terminated, truncated, info = envs.step(actions)
-            agent.step(Timestep(obs, actions, reward, terminated, truncated, aux))
-            verdict: Any = info["final_info"] if truncated.any() else info
-            rewards.append(reward)
-            successes.append(verdict["success"].astype(bool))
-            distance = verdict["obj_to_target"]
-            obs = next_obs
-        success = np.array(successes)
-        hit = success.any(0)
-        found.append(
-            Episode(
-                success_any=hit,
-                success_last=success[-1],
-                returns=np.sum(rewards, 0),
-                first_success=np.where(hit, success.argmax(0), horizon),
-                final_distance=distance,
-                faults=np.zeros(envs.num_envs, int),
-            )
-        )
+    agent: MetaWorldAgent, envs: SyncVectorEnv, k: Sequence[int], horizon: int
+) -> dict[int, Episode]:
+    """Episodes of full length, one after the other: k -> the scores (lane,) after k of them.
+
+    An agent that explores plays the episode that counts apart, and learns nothing from it.
+    """
+    found, obs = {}, envs.reset()[0]
+    for number in range(max(k) + 1):
+        if number in k and agent.explores:
+            agent.adapt()
+            found[number], obs = _episode(agent, envs, obs, horizon)
+            agent.go_on_learning()
+        if number < max(k) or not agent.explores:
+            score, obs = _episode(agent, envs, obs, horizon)
+            if number in k and not agent.explores:
+                found[number] = score
     return found
+
+
+def _episode(
+    agent: MetaWorldAgent, envs: SyncVectorEnv, obs: np.ndarray, horizon: int
+) -> tuple[Episode, np.ndarray]:
+    """One episode from its first observation: its scores, and the next one's first observation."""
+    rewards, successes, distance = [], [], np.zeros(envs.num_envs)
+    for _ in range(horizon):
+        actions, aux = agent.adapt_action(obs)
+        next_obs, reward, terminated, truncated, info = envs.step(actions)
+        agent.step(Timestep(obs, actions, reward, terminated, truncated, aux))
+        verdict: Any = info["final_info"] if truncated.any() else info
+        rewards.append(reward)
+        successes.append(verdict["success"].astype(bool))
+        distance = verdict["obj_to_target"]
+        obs = next_obs
+    success = np.array(successes)
+    hit = success.any(0)
+    score = Episode(
+        success_any=hit,
+        success_last=success[-1],
+        returns=np.sum(rewards, 0),
+        first_success=np.where(hit, success.argmax(0), horizon),
+        final_distance=distance,
+        faults=np.zeros(envs.num_envs, int),
+    )
+    return score, obs
 
 
 def metaworlds_own(
@@ -228,8 +248,8 @@ def metaworlds_own(
     envs = make_vector_env(task, placements, 1, horizon, shown, options.seed)
     # Goals come in the environment's own order: runs are numbered, sentences taken in turn.
     runs = [np.array([n]) for n in range(len(placements))]
-    agent = agent_of(session, policy, trial, runs, horizon, options.seed)
-    episodes = options.adaptation_episodes if session.agent.adapts else 0
+    agent = agent_of(session, policy, trial, runs, horizon, options.seed, options.adapt)
+    episodes = options.adaptation_episodes if session.agent_of(options.adapt).adapts else 0
     try:
         rate, mean_return, per_task = metalearning_evaluation(
             agent,

@@ -88,6 +88,11 @@ class MetaWorldAgent:
         self._programs = _compile(env, agent, params, horizon, deterministic)
 
     @property
+    def explores(self) -> bool:
+        """Whether an episode that it learns from differs from one that counts."""
+        return self._agent.explores
+
+    @property
     def memory(self) -> Any:
         """What the lanes have seen in this adaptation run."""
         return self._memory
@@ -144,6 +149,10 @@ class MetaWorldAgent:
         """Freezes the memory (NOTE 3)."""
         self._frozen = True
 
+    def go_on_learning(self) -> None:
+        """Ends the freeze; no part of Meta-World's interface."""
+        self._frozen = False
+
     def eval_action(self, observations: np.ndarray) -> np.ndarray:
         """Actions (lane, 4) in an evaluation episode."""
         return self._act(observations)
@@ -162,7 +171,13 @@ class MetaWorldAgent:
         if self._starts.any():
             source = self._memory if self._z == "posterior" else self._control
             self._memory, noise = self._programs.begin(
-                self._memory, source, self._starts, self._key, self._episode, self._lane_id
+                self._memory,
+                source,
+                self._starts,
+                self._key,
+                self._episode,
+                self._lane_id,
+                np.bool_(self._frozen),
             )
             self._noise[self._starts] = np.asarray(noise)[self._starts]
             self._origin[self._starts] = obs[self._starts][:, OBJECT] + self._reset_lag
@@ -205,7 +220,7 @@ def _compile(
         return agent.act(params, memory, shown, noise, deterministic), shown
 
     @jax.jit
-    def begin(memory, source, starts, key, episode, lane_id):
+    def begin(memory, source, starts, key, episode, lane_id, exploit):
         """The memory with an episode begun where it starts, and all its noise (lane, time, act)."""
 
         def of_lane(episode, lane_id):
@@ -216,7 +231,7 @@ def _compile(
             return agent_keys(episode_key, lane_id[None])[0], noise.reshape(horizon, ACTION_SIZE)
 
         keys, noise = jax.vmap(of_lane)(episode, lane_id)
-        begun = agent.begin_episode(params, memory, source, keys)
+        begun = agent.begin_episode(params, memory, source, keys, exploit)
         return select_lanes(starts, begun, memory), noise
 
     @jax.jit

@@ -46,6 +46,10 @@ class EvalOptions:
         policy: deterministic (tanh of the mean) or sampled actions.
         z: what an episode is acted on; posterior is the protocol, the others are controls
             (controls.py).
+        adapt: what own episodes change: the belief over z, or which of many z's and mirrors is
+            chosen (`algorithms/cmrl/search.py`).
+        protocol: goal: each goal is adapted to by itself; task: each draw adapts once, on goals of
+            the `train` set, and is scored on all goals.
         paraphrases: sentences of the table, the first trained on or the held-out ones.
         text_control: whose sentence a lane is given: its task's, another task's, a zero vector.
         text: one sentence for every lane, in place of the table's.
@@ -65,6 +69,8 @@ class EvalOptions:
     physics: Literal["mjx", "native", "metaworld"] | None = None
     policy: Literal["deterministic", "sampled"] = "deterministic"
     z: ZSource = "posterior"
+    adapt: Literal["posterior", "search"] = "posterior"
+    protocol: Literal["goal", "task"] = "goal"
     paraphrases: Literal["train", "heldout"] = "train"
     text_control: Literal["none", "shuffled", "zero"] = "none"
     text: str | None = None
@@ -106,6 +112,12 @@ def check_options(options: EvalOptions) -> None:
     if options.weights is not None and what_is(options.weights) != "directory":
         cause = f"--weights {brief(options.weights)} is no directory"
         raise ConfigError(cause, "give the one that holds the text encoder's model")
+    if options.protocol == "task":
+        cause = "--protocol task with --goal-set train: those are the goals it learns on"
+        require(options.goal_set != "train", cause, "leave --goal-set out, or name another")
+        cause = "--protocol task with --physics metaworld"
+        cure = "use --protocol goal, which is Meta-World's own, or --physics native"
+        require(options.physics != "metaworld", cause, cure)
     if options.physics == "metaworld" and options.z in DONATED:
         cause = f"--z {options.z} with --physics metaworld, where lanes know nothing of each other"
         raise ConfigError(cause, "use --z posterior, prior or text, or --physics native")
@@ -157,6 +169,8 @@ def check_run(options: EvalOptions, run: Path) -> Config:
     is_metaworlds = options.physics != "metaworld" or config.env.name == "ml4"
     cause = f"--physics metaworld with env.name {config.env.name} ({run})"
     require(is_metaworlds, cause, "leave it out: Meta-World has no such environment")
+    cause = f"--adapt search with {rules.kind} ({run})"
+    require(options.adapt != "search" or rules.searches, cause, "leave it out: no z to search")
     if not rules.adapts:
         told = f"with {rules.kind} ({run})"
         if any(k):

@@ -76,7 +76,7 @@ def score(run: Path, session: Session, policy: Policy, options: EvalOptions) -> 
     trial = trial_of([policy], session, options, tasks)
     unit = config.eval.goals * len(session.eval_tasks)
     lanes = batch_lanes(len(tasks) * options.goals * options.draws, unit, lane_budget(options))
-    evaluator = session.evaluator(lanes, options.horizon)
+    evaluator = session.evaluator(lanes, options.horizon, adapt=options.adapt)
     k = options.k if options.k is not None else config.eval.final_k
     scores = of_policy(evaluator.run([policy.params], trial, k, options.seed), 0)
     return Evaluation(

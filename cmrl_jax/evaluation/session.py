@@ -159,6 +159,12 @@ class Session:
     def agent(self) -> Agent:
         return self.algorithm.agent
 
+    def agent_of(self, adapt: str) -> Agent:
+        """The agent that adapts by the belief (`posterior`) or by `search`."""
+        agent = self.algorithm.searching if adapt == "search" else self.algorithm.agent
+        assert agent is not None  # `options.check_run` has looked
+        return agent
+
     def placements(
         self, goal_set: str, goals: int, tasks: Sequence[str] | None = None
     ) -> np.ndarray:
@@ -178,7 +184,11 @@ class Session:
         return Trial(self.eval_tasks, self.placements(goal_set, goals), texts[None])
 
     def evaluator(
-        self, lanes: int | None = None, horizon: int | None = None, policies: int = 1
+        self,
+        lanes: int | None = None,
+        horizon: int | None = None,
+        policies: int = 1,
+        adapt: str = "posterior",
     ) -> Evaluator:
         """An evaluator; with a program that an earlier one of its kind has compiled.
 
@@ -186,12 +196,14 @@ class Session:
             lanes: of a batch; by default those of a periodic evaluation of training.
             horizon: control steps an episode; the run's own by default.
             policies: scored side by side.
+            adapt: see `EvalOptions`.
         """
         lanes = lanes or self.config.eval.goals * len(self.eval_tasks)
-        kind = lanes, horizon or self.config.env.horizon, policies
+        kind = lanes, horizon or self.config.env.horizon, policies, adapt
+        agent = self.agent_of(adapt)
         kept = self._parts.evaluators
         if self.env is not self._parts.env or kind not in kept:
-            made = Evaluator(self.config, self.env, self.agent, lanes, horizon, policies)
+            made = Evaluator(self.config, self.env, agent, lanes, horizon, policies)
             if self.env is not self._parts.env:
                 return made
             kept[kind] = made

@@ -99,7 +99,16 @@ def describe(options: EvalOptions, config: Config) -> str:
     where = f"{options.goals} goals of '{options.goal_set}', horizon {horizon_of(options, config)}"
     words = [where, f"seed {options.seed}", options.physics or config.env.physics]
     usual = asdict(EvalOptions())
-    for name in ("draws", "policy", "z", "paraphrases", "text_control", "text"):
+    for name in (
+        "draws",
+        "policy",
+        "adapt",
+        "protocol",
+        "z",
+        "paraphrases",
+        "text_control",
+        "text",
+    ):
         if (value := getattr(options, name)) != usual[name]:
             words.append(f"{name.replace('_', ' ')} {value}")
     return ", ".join(words)

@@ -160,7 +160,7 @@ def compiled_evaluator(
     started = time.monotonic()
     while True:
         print(f"compiling {plan.policies} x {plan.lanes} lanes ...", flush=True)
-        evaluator = session.evaluator(plan.lanes, options.horizon, plan.policies)
+        evaluator = session.evaluator(plan.lanes, options.horizon, plan.policies, options.adapt)
         evaluator.compile(policy.params, width)
         smaller = fitted(plan, evaluator.memory_bytes(), memory_limit())
         if smaller == plan:

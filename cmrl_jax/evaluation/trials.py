@@ -19,6 +19,7 @@ from cmrl_jax.evaluation.options import EvalOptions
 from cmrl_jax.evaluation.session import Policy, Session
 from cmrl_jax.registry import other_task
 from cmrl_jax.text.goals import GoalTable, load_goals
+from envs.goal_names import GOALS
 
 LANES = {"cpu": 256}
 LANES_ON_ACCELERATORS = 8192
@@ -117,11 +118,31 @@ def trial_of(
     return Trial(
         tasks=tasks,
         placements=session.placements(options.goal_set, options.goals, tasks),
+        adaptation=adaptation_goals(session, options, tasks),
         texts=np.stack([text_per_goal(vectors, options.goals) for vectors in texts]),
         draws=options.draws,
         z=options.z,
         deterministic=options.policy == "deterministic",
     )
+
+
+def adaptation_goals(
+    session: Session, options: EvalOptions, tasks: tuple[str, ...]
+) -> np.ndarray | None:
+    """Goals that the task protocol learns on (task, draw, episode, goal_size); None by goal.
+
+    Each draw takes the `train` set in an order of its own, which the seed names.
+    """
+    if options.protocol == "goal":
+        return None
+    k = options.k if options.k is not None else session.config.eval.final_k
+    goals = session.placements("train", GOALS, tasks)
+    orders = [
+        np.random.default_rng([options.seed, draw]).permutation(goals.shape[1])
+        for draw in range(options.draws)
+    ]
+    turns = np.arange(max(max(k), 1)) % goals.shape[1]
+    return goals[:, np.stack(orders)[:, turns]]
 
 
 def task_sentences(

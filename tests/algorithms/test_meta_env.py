@@ -14,6 +14,7 @@ from cmrl_jax.algorithms.common.rollout import episode_figures, rollout
 from cmrl_jax.evaluation.episode import Lanes, make_episode
 
 HORIZON, LANES = 20, 16
+TRUE = np.bool_(True)
 SMALL = {
     "env.name": "point",
     "env.horizon": HORIZON,
@@ -118,7 +119,7 @@ def test_an_evaluation_episode_ends_with_a_fall():
         np.array([1, 0], np.int32), np.arange(2, dtype=np.int32), np.zeros((2, 2), np.float32)
     )
     memory = {"seen": jnp.zeros((1, 2))}
-    memory, scores = episode(None, memory, memory, lanes, np.bool_(True), jax.random.key(0))
+    memory, scores = episode(None, memory, memory, lanes, TRUE, TRUE, jax.random.key(0))
     np.testing.assert_array_equal(memory["seen"], [[7, 7]])
     np.testing.assert_allclose(scores.returns, [[4.4, -sum(0.15 * n for n in range(1, 8))]], 1e-5)
     assert scores.first_success.tolist() == [[3, HORIZON]]
@@ -128,12 +129,12 @@ def test_an_evaluation_episode_ends_with_a_fall():
 class Runner:
     """An agent that runs to the right and counts the transitions it is shown."""
 
-    adapts, chunk = True, 5
+    adapts, explores, chunk = True, False, 5
 
     def init(self, told):
         return {"seen": jnp.zeros(told.task_row.shape)}
 
-    def begin_episode(self, params, memory, source, keys):
+    def begin_episode(self, params, memory, source, keys, exploit):
         return memory
 
     def act(self, params, memory, obs, noise, deterministic):

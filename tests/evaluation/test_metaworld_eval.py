@@ -62,7 +62,7 @@ def adapted(session, policy, trial):
     recorder = Recorder(envs)
     agent = agent_of(session, policy, one, [np.arange(LANES)], HORIZON, seed=3)
     agent.init()
-    scores = adaptation_run(agent, recorder, 2, HORIZON)  # pyright: ignore[reportArgumentType]
+    scores = adaptation_run(agent, recorder, (0, 1), HORIZON)  # pyright: ignore[reportArgumentType]
     yield agent, recorder.episodes[:2], scores, one
     envs.close()
 
@@ -114,7 +114,7 @@ def test_successes_are_metaworlds(trial):
     envs.call("toggle_terminate_on_success", False)
     set_goals(envs, "drawer-close", place, False)
     agent: Any = Player(reference.action)
-    for found in adaptation_run(agent, envs, 2, steps):
+    for found in adaptation_run(agent, envs, (0, 1), steps).values():
         assert found.success_any.item() and found.success_last.item() == reference.success[-1]
         assert found.first_success.item() == np.flatnonzero(reference.success)[0] > 0
         assert found.returns.item() == pytest.approx(reference.reward.sum(), rel=1e-5)
@@ -263,7 +263,7 @@ def test_metaworlds_own_function_drives_the_agent_as_it_should(session, policy, 
     agent.init()
     agent.adapt()
     envs.call("toggle_terminate_on_success", False)
-    adaptation_run(agent, envs, 1, HORIZON)
+    adaptation_run(agent, envs, (0,), HORIZON)
     assert agent.count() == 0
     envs.close()
 

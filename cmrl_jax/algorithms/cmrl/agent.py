@@ -59,6 +59,8 @@ class CmrlAgent:
     learner: Learner
     chunk: int
 
+    explores = False
+
     @property
     def adapts(self) -> bool:
         return self.learner.inference is not None
@@ -73,8 +75,14 @@ class CmrlAgent:
         return Memory(belief, told.text, told.text_mask, conditioning)
 
     def begin_episode(
-        self, params: PolicyParams, memory: Memory, source: Memory, keys: jax.Array
+        self,
+        params: PolicyParams,
+        memory: Memory,
+        source: Memory,
+        keys: jax.Array,
+        exploit: jax.Array,
     ) -> Memory:
+        del exploit  # every episode is acted on a draw from the belief
         inference = self.learner.inference
         if inference is None:
             return memory

@@ -11,6 +11,7 @@ from cmrl_jax.algorithms.base import Algorithm, RunState
 from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
 from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.algorithms.cmrl.search import SearchAgent
 from cmrl_jax.config.schema import Config
 from envs.base import MetaEnv
 
@@ -29,11 +30,15 @@ def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
     def gradient_steps(run: RunState) -> jax.Array:
         return run.learner.gradient_steps
 
+    searching = None
+    if learner.inference is not None:
+        searching = SearchAgent(learner, config.collect.chunk, goal_vectors[:, 0], env.symmetries)
     return Algorithm(
         agent=CmrlAgent(learner, config.collect.chunk),
         init=lambda key: init_run(config, env, learner, key),
         make_iteration=make_iteration,
         policy_params=policy_params,
         gradient_steps=gradient_steps,
+        searching=searching,
         parts=learner,
     )

@@ -16,6 +16,7 @@ class Rules:
 
     Attributes:
         adapts: whether own episodes change what its policy does.
+        searches: whether it has an agent that adapts by search.
         reads_text: whether its policy is told a sentence.
         is_told_the_task: whether it is told which of its training tasks it acts on.
         can_start_from_text: whether the sentence alone says something before any episode.
@@ -58,6 +59,7 @@ class Rules:
         self._config = config
         conditioning, fusion = config.model.conditioning, config.encoder.goal_fusion
         self.adapts = conditioning == "z"
+        self.searches = self.adapts
         self.reads_text = self.adapts and fusion != "none"
         self.can_start_from_text = self.adapts and fusion in ("factor", "both")
         self.is_told_the_task = conditioning == "task_id"
