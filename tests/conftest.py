@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -36,11 +37,13 @@ def monkeypatch(monkeypatch):
     """pytest's own; what it patches may be traced, so compiled programs are not shared with it."""
 
     def forget():
-        if session := sys.modules.get("cmrl_jax.evaluation.session"):
+        session = sys.modules.get("cmrl_jax.evaluation.session")
+        if type(session) is ModuleType:  # no stand-in for it
             session.forget_programs()
 
-    right = monkeypatch.setattr
-    monkeypatch.setattr = lambda *args, **options: (forget(), right(*args, **options))[1]
+    setattr_, undo = monkeypatch.setattr, monkeypatch.undo
+    monkeypatch.setattr = lambda *args, **options: (forget(), setattr_(*args, **options))[1]
+    monkeypatch.undo = lambda: (forget(), undo())[1]
     yield monkeypatch
     forget()
 

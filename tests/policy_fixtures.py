@@ -46,8 +46,7 @@ class MovingEnv(Ml4Env):
 
 def random_policy(session: Session, seed: int):
     """PolicyParams with every weight drawn from a normal of std 0.5."""
-    algorithm = session.algorithm
-    params = algorithm.policy_params(jax.eval_shape(algorithm.init, jax.random.key(0)))
+    params = jax.eval_shape(session.algorithm.parts.init, jax.random.key(0))
     generator = np.random.default_rng(seed)
     draw = lambda x: generator.normal(0, 0.5, x.shape).astype(x.dtype)
     return PolicyParams(

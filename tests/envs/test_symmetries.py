@@ -1,5 +1,6 @@
 """The mirrors of the scene: what an agent sees and does in them."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,7 +13,10 @@ def test_only_canonical_observations_have_mirrors():
     assert (of_obs == 1).all() and (of_action == 1).all()
 
 
-@pytest.mark.parametrize(("mirror", "signs"), enumerate([(1, 1), (-1, 1), (1, -1), (-1, -1)]))
+MIRRORS = [(1, 1), (-1, 1), (1, -1), (-1, -1)]
+
+
+@pytest.mark.parametrize(("mirror", "signs"), list(enumerate(MIRRORS)))
 def test_a_mirrored_scene_is_seen_as_its_own_signs_say(mirror, signs):
     """Hand, object and goal on the other side of where the object stood: the same numbers."""
     of_obs, of_action = Ml4Env(physics="native", obs_mode="canonical").symmetries
@@ -24,7 +28,7 @@ def test_a_mirrored_scene_is_seen_as_its_own_signs_say(mirror, signs):
         for axis, sign in enumerate(signs):
             place = start + axis
             there[place] = origin[axis] + sign * (obs[place] - origin[axis])
-    seen = np.asarray(canonical_obs(np.float32(obs), np.float32(origin), True))
-    mirrored = np.asarray(canonical_obs(np.float32(there), np.float32(origin), True))
+    seen = np.asarray(canonical_obs(jnp.asarray(obs), jnp.asarray(origin), True))
+    mirrored = np.asarray(canonical_obs(jnp.asarray(there), jnp.asarray(origin), True))
     np.testing.assert_allclose(mirrored, of_obs[mirror] * seen, atol=1e-5)
     assert of_action[mirror].tolist() == [*signs, 1, 1]
