@@ -73,9 +73,10 @@ def _constrain(tree: Any, spec: PartitionSpec) -> Any:
 
 
 def placed(run: Any, mesh: Mesh | None) -> Any:
-    """The shapes of a `collect.RunState` with where each array lies.
+    """The shapes of a `RunState` with where each array lies.
 
-    Rings are split by slot, all else is on every device; without a mesh jax's default stays.
+    What has `rows` (task, slot, ...), a ring, is split by slot; all else is on every device.
+    Without a mesh jax's default stays.
     """
     if mesh is None:
         return run
@@ -86,9 +87,9 @@ def placed(run: Any, mesh: Mesh | None) -> Any:
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where)
 
     whole = jax.tree.map(lambda leaf: place(leaf, everywhere), run)
-    rings = (whole.replay, whole.context)
-    replay, context = (ring.replace(rows=place(ring.rows, by_slot)) for ring in rings)
-    return whole.replace(replay=replay, context=context)
+    is_ring = lambda part: hasattr(part, "rows")
+    split = lambda part: part.replace(rows=place(part.rows, by_slot)) if is_ring(part) else part
+    return jax.tree.map(split, whole, is_leaf=is_ring)
 
 
 def on_one_device(tree: Any) -> Any:

@@ -36,8 +36,7 @@ class AlgorithmEntry:
     Attributes:
         make: (Config, MetaEnv, text vectors (training task, paraphrase, G)) ->
             `algorithms.base.Algorithm`; a function, or where to find it as "module:function".
-        rules: a class with what is asked before jax is imported (see `algorithms/cmrl/rules.py`),
-            or where to find it.
+        rules: its `algorithms.rules.AlgorithmRules`, a class, or where to find it.
     """
 
     make: str | Callable[..., Any]
@@ -119,7 +118,7 @@ def make_algorithm(config: Any, env: Any, goal_vectors: Any) -> Any:
 
 
 def rules_of(config: Any) -> Any:
-    """The rules of a configuration's algorithm; see `algorithms/cmrl/rules.py`.
+    """The `AlgorithmRules` of a configuration.
 
     Raises:
         ValueError: unknown algorithm (two lines: cause, cure).

@@ -128,7 +128,7 @@ class Ml4Env:
     def reset_lag(self, task_id: jax.Array) -> jax.Array:
         """From where the reset observation shows a task's object to where it stands (3,), metres.
 
-        Zero but for window-close, see the NOTE in `tasks.py`.
+        Zero but for window-close, see the NOTE in `tasks/window.py`.
         """
         axis = self.physics.fixture(self._scene_id[task_id]).axis
         return (self._data.start_slide - self._data.first_obs_slide)[task_id] * axis

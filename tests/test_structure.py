@@ -50,6 +50,7 @@ LIGHT = {
     "registry",
     "stop",
     "streams",
+    "algorithms.rules",
     "algorithms.cmrl.rules",
     *(f"config.{name}" for name in ("schema", "rules", "files", "yaml_tree")),
     *(f"storage.{name}" for name in ("run_dir", "documents", "run_files", "run_groups", "locks")),

@@ -6,7 +6,7 @@ stay in its folder.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -38,7 +38,8 @@ class Agent(Protocol):
     Attributes:
         adapts: whether experience changes what it does.
         explores: whether an episode that it learns from differs from one that counts.
-        chunk: control steps that may pass between two calls of `observe`.
+        chunk: control steps that may pass between two calls of `observe`. Meta-World's own
+            evaluation shows a whole episode at once, when it has ended.
     """
 
     @property
@@ -114,21 +115,27 @@ class Algorithm:
     """Pure functions of one configuration.
 
     Attributes:
-        agent: what acts.
+        agents: what acts, by what own episodes change (`AlgorithmRules.ways`); the first is the
+            default.
         init: key -> RunState before iteration 0.
         make_iteration: goals (training task, goal, goal_size) that episodes begin with, or None for
             the environment's own resets -> one jittable training iteration, RunState -> RunState,
-            metrics. Metrics are float32, () or one value a training task (task,).
+            metrics. Metrics are float32, () or one value a training task (task,). Read by name
+            are `success_any` and `return` (for lines and plots), `physics_faults` and `skipped`
+            (steps put back, share of gradients dropped: a run that has too many stops).
         policy_params: RunState -> the parameters that the agent acts with, saved as a policy.
         gradient_steps: RunState -> () int32, gradient steps applied.
-        searching: an agent that adapts by search, where the algorithm has one.
         parts: the algorithm's own, for what inspects or fine-tunes it.
     """
 
-    agent: Agent
+    agents: Mapping[str, Agent]
     init: Callable[[jax.Array], RunState]
     make_iteration: Callable[[jax.Array | None], TrainIteration]
     policy_params: Callable[[RunState], Any]
     gradient_steps: Callable[[RunState], jax.Array]
-    searching: Agent | None = None
     parts: Any = None
+
+    @property
+    def agent(self) -> Agent:
+        """The default agent."""
+        return next(iter(self.agents.values()))

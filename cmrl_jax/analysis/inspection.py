@@ -1,6 +1,6 @@
 """What a policy does inside: how its actor routes on every task, and what z it infers there.
 
-One short evaluation by the protocol (evaluate.py) on MuJoCo C: `K` episodes of own experience, then
+One short evaluation by the protocol (evaluator.py) on MuJoCo C: `K` episodes of experience, then
 the reported one, whose posterior, z and routing are kept. The critics route too, but a policy
 checkpoint does not hold them.
 """

@@ -50,7 +50,7 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         "--k",
         type=adaptation,
         metavar="0,1,2",
-        help="adaptation episodes [eval.final_k of the run]",
+        help="adaptation episodes [eval.final_k of the run; with --adapt search 0,1,2,5,10,20]",
     )
     add("--tasks", type=names, metavar="A,B", help="tasks to evaluate [those of the run]")
     add("--goals", type=goal_count, default=GOALS, metavar="N", help="goals a task, 1 to 50 [50]")
@@ -90,8 +90,8 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         default="posterior",
         metavar="Z",
         choices=Z_SOURCES,
-        help="posterior; prior: N(0, I); shuffled: another lane's posterior; other: another "
-        "task's; text: no experience [posterior]",
+        help="posterior; prior: no text, no experience; shuffled: another lane's posterior; other: "
+        "another task's; text: no experience [posterior]",
     )
     add(
         "--paraphrases",
@@ -178,6 +178,8 @@ def options_of(args: argparse.Namespace) -> EvalOptions:
         horizon=args.horizon,
         physics=args.physics,
         policy=args.policy,
+        adapt=args.adapt,
+        protocol=args.protocol,
         z=args.z,
         paraphrases=args.paraphrases,
         text_control=args.text_control,
@@ -259,6 +261,8 @@ def run_sweep(words: Sequence[str]) -> int:
     """The command `sweep`; returns the exit code."""
     args = parse(sweep_parser(), words)
     options = options_of(args)
+    if args.compare and (options.adapt != "posterior" or options.protocol != "goal"):
+        raise ConfigError("--compare with --adapt or --protocol", "leave --compare out")
     if args.compare and options.z in DONATED:
         cause = f"--compare with --z {options.z}, which no adaptation run has by itself"
         raise ConfigError(cause, "leave --compare out, or use --z posterior")

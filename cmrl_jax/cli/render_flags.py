@@ -8,8 +8,8 @@ from typing import Any
 
 from cmrl_jax.cli.flags import add_force, episodes, goal_index, natural, seed, steps
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.rules import check_goal_set, require
-from cmrl_jax.config.schema import ConfigError, call_envs
+from cmrl_jax.config.rules import check_goal_set
+from cmrl_jax.config.schema import ConfigError, call_envs, require
 from cmrl_jax.registry import rules_of
 from cmrl_jax.storage.output_files import writable
 from cmrl_jax.storage.run_dir import find_run

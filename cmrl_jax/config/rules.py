@@ -10,9 +10,9 @@ from cmrl_jax.config.schema import (
     GOAL_ABLATIONS,
     TEXT_ENCODERS,
     Config,
-    ConfigError,
     call_envs,
     leaves,
+    require,
 )
 from cmrl_jax.registry import environment, rules_of
 from envs.command_line import LARGEST, suggest
@@ -32,12 +32,6 @@ def validate(config: Config) -> None:
     cause = "train.env_steps and train.minutes are both 0: the run would never end"
     require(bool(config.train.env_steps or config.train.minutes), cause, "set one of them")
     call_envs(lambda: rules_of(config)).check()
-
-
-def require(holds: bool, cause: str, cure: str) -> None:
-    """Raises ConfigError unless a rule holds."""
-    if not holds:
-        raise ConfigError(cause, cure)
 
 
 def _check_bounds(config: Config) -> None:

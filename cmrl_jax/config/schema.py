@@ -34,6 +34,12 @@ class ConfigError(ValueError):
         self.cure = cure
 
 
+def require(holds: bool, cause: str, cure: str) -> None:
+    """Raises ConfigError unless a rule holds."""
+    if not holds:
+        raise ConfigError(cause, cure)
+
+
 def call_envs(build: Callable[[], Any], about: str = "") -> Any:
     """Calls into `envs`, whose ValueErrors carry cause and cure on two lines."""
     with as_config_error(about):
@@ -74,7 +80,7 @@ class TasksConfig:
 
 @dataclass(frozen=True)
 class EnvConfig:
-    name: str = doc("ml4", "registered environment; all but horizon below is ml4's")
+    name: str = doc("ml4", "registered environment; physics, goal_observable, obs_mode are ml4's")
     physics: Literal["mjx", "native"] = doc(
         "mjx", "mjx: on the device; native: MuJoCo C on the host, Meta-World's own contacts"
     )
@@ -262,7 +268,7 @@ class Config:
     name: str = doc("cmrl", "name of the preset, recorded with the run")
     seed: int = doc(0, "seed of the whole run", high=LARGEST_SEED)
     algorithm: str = doc(
-        "cmrl", "registered algorithm; model, encoder, kl, sac and collect are cmrl's"
+        "cmrl", "registered algorithm; model, encoder, kl, sac and most of collect are cmrl's"
     )
     tasks: TasksConfig = TasksConfig()
     env: EnvConfig = EnvConfig()

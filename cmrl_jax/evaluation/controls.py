@@ -43,7 +43,7 @@ def sources(
 
 
 def donors(z: str, lane_id: np.ndarray, env_task: np.ndarray) -> np.ndarray:
-    """The lane whose belief and text each lane's z is drawn from, (lane,) indices.
+    """The lane whose memory each lane acts on, (lane,) indices.
 
     Args:
         z: `shuffled` takes another lane of the whole evaluation, tasks mixed; `other` the same

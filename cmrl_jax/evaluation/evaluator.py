@@ -1,10 +1,10 @@
-"""The meta-test protocol: success after k adaptation episodes, trained on by nothing.
+"""The meta-test protocol: success after k adaptation episodes; no parameter changes.
 
-One adaptation run is a fixed goal and an agent's memory that starts empty. Episode e is acted on
-what episodes 0..e-1 have shown (CMRL: z from the posterior over all own transitions; the first from
-the text, or from the prior without a goal factor), deterministically apart from the agent's own
-draw. So the score at k is the score of episode k, and one run of max(k) + 1 episodes gives the
-whole curve (oyster evaluates the same way: katerakelly/oyster: rlkit/core/rl_algorithm.py).
+One adaptation run is a memory that starts empty, on one goal or, by task, on goals of its own.
+Episode e is acted on what episodes 0..e-1 have shown (CMRL: z from the posterior over all own
+transitions; the first from the text, or from the prior without a goal factor), deterministically
+apart from the agent's own draw. One run of max(k) episodes and those that count gives the whole
+curve (oyster evaluates the same way: katerakelly/oyster: rlkit/core/rl_algorithm.py).
 
 Lanes are task x goal x draw of each policy, in batches of a fixed number of lanes, so that every
 evaluation of a process runs one compiled program, controls included.
@@ -27,8 +27,8 @@ from cmrl_jax.evaluation.options import MOST_DRAWS, ZSource
 from envs.base import MetaEnv
 
 GOAL_IDS = 1000  # more than the goals of any set
-LEARNER = 500  # goal by which a lane's noise is named that learns for all goals of its task
-TASK_IDS = 4  # tasks whose lanes are numbered side by side
+LEARNER = 500  # stands for the goal in the name of a lane that learns for all goals of its task
+TASK_IDS = 4  # names come in blocks of as many tasks, so that the first four keep their noise
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Trial:
     def learners(self) -> Trial:
         """One lane for each task and draw, which learns for all goals of the task."""
         first = replace(self, placements=self.placements[:, :1], texts=self.texts[:, :, :1])
-        return replace(first, first_goal=self.first_goal + LEARNER)
+        return replace(first, first_goal=LEARNER)
 
     def of_goal(self, goal: int) -> Trial:
         """One goal of every task, with the noise that it has among the others."""

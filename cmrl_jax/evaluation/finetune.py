@@ -274,7 +274,7 @@ class FineTuning:
         self.own_faults += int(metrics["physics_faults"])
 
     def read_out(self, placements: np.ndarray, seed: int) -> Score:
-        """Success on goals (goal, 3), with the belief over all own transitions."""
+        """Success on goals (goal, goal_size), with the belief over all own transitions."""
         goals, state = len(placements), self.run.learner
         texts = np.broadcast_to(self.text, (1, goals, len(self.text)))
         row, task = np.zeros(goals, np.int32), self.env.tasks.index(self.task)

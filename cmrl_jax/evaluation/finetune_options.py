@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cmrl_jax.config.rules import require
-from cmrl_jax.config.schema import Config, ConfigError
+from cmrl_jax.config.schema import Config, ConfigError, require
 from cmrl_jax.registry import environment
 from envs.goal_names import GOALS
 

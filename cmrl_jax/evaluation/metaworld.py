@@ -32,7 +32,7 @@ from cmrl_jax.evaluation.cells import Row
 from cmrl_jax.evaluation.episode import Episode
 from cmrl_jax.evaluation.evaluator import Trial, lane_names
 from cmrl_jax.evaluation.metaworld_agent import MetaWorldAgent
-from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks
+from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks, ks_of
 from cmrl_jax.evaluation.scores import cell_rows, format_scores, summarise
 from cmrl_jax.evaluation.session import Policy, Session, load_policy, prepare_jax
 from cmrl_jax.evaluation.settings import describe, horizon_of, result_fields, row_columns
@@ -64,7 +64,7 @@ def evaluate_in_metaworld(
     policy = load_policy(run, session, checkpoint)
     tasks = evaluated_tasks(options, config)
     trial = trial_of([policy], session, options, tasks)
-    k = options.k if options.k is not None else config.eval.final_k
+    k = ks_of(options, config)
     parts, own = [], {}
     for row, task in enumerate(tasks):
         started = time.monotonic()

@@ -54,6 +54,8 @@ class MetaWorldAgent:
 
     Args:
         env: the configuration's `env` section.
+        agent, params: what acts. It observes whole episodes: one that acts on what it observed
+            within an episode cannot be scored so.
         texts: text vectors (run, lane, G); adaptation run n takes row n modulo their number.
         lane_ids: names of the lanes' noise (run, lane), see `Evaluator`.
         train_row: the task's row among the training tasks, read where the policy is told the task.
@@ -150,8 +152,10 @@ class MetaWorldAgent:
         self._frozen = True
 
     def go_on_learning(self) -> None:
-        """Ends the freeze; no part of Meta-World's interface."""
+        """Ends the freeze after one episode, which shares its number with the next (NOTE 4); no
+        part of Meta-World's interface."""
         self._frozen = False
+        self._episode -= 1
 
     def eval_action(self, observations: np.ndarray) -> np.ndarray:
         """Actions (lane, 4) in an evaluation episode."""

@@ -9,23 +9,26 @@ from typing import Any, Literal
 
 from cmrl_jax.commands import shown
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.rules import check_goal_set, require
+from cmrl_jax.config.rules import check_goal_set
 from cmrl_jax.config.schema import (
     MOST_EPISODES,
     MOST_STEPS,
     Config,
     ConfigError,
     call_envs,
+    require,
 )
 from cmrl_jax.registry import environment, rules_of, task_names
 from cmrl_jax.storage.run_dir import find_run
 from envs.command_line import LARGEST, brief, suggest, what_is
 from envs.goal_names import GOALS, LARGEST_SEED
+from envs.tasks import METAWORLD_TASKS
 
 ZSource = Literal["posterior", "prior", "shuffled", "other", "text"]
 Z_SOURCES: tuple[ZSource, ...] = typing.get_args(ZSource)
 DONATED = ("shuffled", "other")  # z from another lane's belief: lanes depend on one another
-# A draw is one of the numbers that name a lane's noise, in 32 bits (`evaluate.lane_names`), and
+SEARCH_K = (0, 1, 2, 5, 10, 20)  # where a search is scored unless --k says otherwise
+# A draw is one of the numbers that name a lane's noise, in 32 bits (`evaluator.lane_names`), and
 # every lane keeps its text in memory.
 MOST_DRAWS = 10_000
 
@@ -115,6 +118,10 @@ def check_options(options: EvalOptions) -> None:
     if options.protocol == "task":
         cause = "--protocol task with --goal-set train: those are the goals it learns on"
         require(options.goal_set != "train", cause, "leave --goal-set out, or name another")
+        cause = f"--protocol task with --z {options.z}: goals of a task share what they know"
+        require(options.z not in DONATED, cause, "use --protocol goal")
+        cause = "--protocol task with --paraphrases heldout: goals of a task share a sentence"
+        require(options.paraphrases == "train", cause, "use --protocol goal")
         cause = "--protocol task with --physics metaworld"
         cure = "use --protocol goal, which is Meta-World's own, or --physics native"
         require(options.physics != "metaworld", cause, cure)
@@ -160,17 +167,18 @@ def check_run(options: EvalOptions, run: Path) -> Config:
     """
     config = run_config(find_run(run))
     rules = call_envs(lambda: rules_of(config))
-    k = options.k if options.k is not None else config.eval.final_k
+    k = ks_of(options, config)
     tasks = evaluated_tasks(options, config)
     own = environment(config.env.name).tasks
     for task in tasks:
         cure = f"name tasks of {config.env.name}: {', '.join(own)}"
         require(task in own, f"--tasks {task}: another environment's than the run's", cure)
-    is_metaworlds = options.physics != "metaworld" or config.env.name == "ml4"
-    cause = f"--physics metaworld with env.name {config.env.name} ({run})"
-    require(is_metaworlds, cause, "leave it out: Meta-World has no such environment")
-    cause = f"--adapt search with {rules.kind} ({run})"
-    require(options.adapt != "search" or rules.searches, cause, "leave it out: no z to search")
+        cause = f"--physics metaworld with the task {task} ({run}), which Meta-World has not"
+        is_there = options.physics != "metaworld" or task in METAWORLD_TASKS
+        require(is_there, cause, "leave --physics out, or name other tasks")
+    is_way = options.adapt == EvalOptions.adapt or options.adapt in rules.ways
+    cause = f"--adapt {options.adapt} with {rules.kind} ({run})"
+    require(is_way, cause, f"leave it out, or use one of: {', '.join(rules.ways)}")
     if not rules.adapts:
         told = f"with {rules.kind} ({run})"
         if any(k):
@@ -204,6 +212,13 @@ def check_run(options: EvalOptions, run: Path) -> Config:
         cause = f"--text with goals.table {config.goals.table} ({run}), which has no encoder"
         raise ConfigError(cause, "leave --text out")
     return config
+
+
+def ks_of(options: EvalOptions, config: Config) -> tuple[int, ...]:
+    """Numbers of adaptation episodes to score at: those asked for, else what is usual."""
+    if options.k is not None:
+        return options.k
+    return SEARCH_K if options.adapt == "search" else config.eval.final_k
 
 
 def evaluated_tasks(options: EvalOptions, config: Config) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from cmrl_jax.config.schema import Config, call_envs
 from cmrl_jax.evaluation.cells import Row
-from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks
+from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks, ks_of
 from cmrl_jax.evaluation.scores import cell_rows, format_scores, of_policy, summarise
 from cmrl_jax.evaluation.session import Policy, Session
 from cmrl_jax.evaluation.settings import describe, result_fields, row_columns
@@ -77,7 +77,7 @@ def score(run: Path, session: Session, policy: Policy, options: EvalOptions) -> 
     unit = config.eval.goals * len(session.eval_tasks)
     lanes = batch_lanes(len(tasks) * options.goals * options.draws, unit, lane_budget(options))
     evaluator = session.evaluator(lanes, options.horizon, adapt=options.adapt)
-    k = options.k if options.k is not None else config.eval.final_k
+    k = ks_of(options, config)
     scores = of_policy(evaluator.run([policy.params], trial, k, options.seed), 0)
     return Evaluation(
         tasks=summarise(scores, tasks),

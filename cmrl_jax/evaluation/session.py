@@ -6,9 +6,10 @@ Shared by training, evaluation and benchmarks.
 from __future__ import annotations
 
 import os
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from cmrl_jax.config.schema import Config, call_envs
 from cmrl_jax.evaluation.controls import text_per_goal
 from cmrl_jax.evaluation.evaluator import Evaluator, Trial
 from cmrl_jax.jax_runtime import cache_directory, check_switches, first_device, jit_once
-from cmrl_jax.registry import algorithm, environment, make_algorithm, make_environment
+from cmrl_jax.registry import algorithm, environment, make_algorithm, make_environment, rules_of
 from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
 from cmrl_jax.text.goals import GoalTable, load_goals
@@ -92,52 +93,42 @@ class Parts:
     """
 
     def __init__(self, config: Config, train_goals: jax.Array):
+        self.entries = environment(config.env.name), algorithm(config.algorithm)
         self.env: MetaEnv = call_envs(lambda: make_environment(config.env))
         self.algorithm: Algorithm = call_envs(lambda: make_algorithm(config, self.env, train_goals))
-        self.evaluators: dict[Any, Evaluator] = {}
+        self.evaluators: OrderedDict[Any, Evaluator] = OrderedDict()
         self.training: dict[Any, Any] = {}
 
 
-_KEPT = 4  # configurations; a compiled program is some hundred megabytes
+_KEPT = 4  # configurations, and evaluators of each; a program may take some hundred megabytes
 _parts: OrderedDict[Any, Parts] = OrderedDict()
+_lock = threading.RLock()
 
 
 def _parts_of(config: Config, goals: GoalTable, train_goals: jax.Array) -> Parts:
-    key = (
-        _shaping(config),
-        goals.sha256,
-        id(environment(config.env.name)),
-        id(algorithm(config.algorithm)),
-        jax.config.jax_debug_nans,
-        jax.config.jax_debug_infs,
-    )
-    if key not in _parts:
-        _parts[key] = Parts(config, train_goals)
-    _parts.move_to_end(key)
-    while len(_parts) > _KEPT:
-        _parts.popitem(last=False)
-    return _parts[key]
+    debug = jax.config.jax_debug_nans, jax.config.jax_debug_infs
+    key = rules_of(config).shaping(), goals.sha256, debug
+    entries = environment(config.env.name), algorithm(config.algorithm)
+    with _lock:
+        if key not in _parts or any(
+            x is not y for x, y in zip(_parts[key].entries, entries, strict=True)
+        ):
+            _parts[key] = Parts(config, train_goals)
+        return _kept(_parts, key)
 
 
-def _shaping(config: Config) -> Config:
-    """A configuration with what no program depends on at its default."""
-    usual = Config()
-    length = replace(config.train, env_steps=usual.train.env_steps, minutes=usual.train.minutes)
-    return replace(
-        config,
-        name=usual.name,
-        seed=usual.seed,
-        train=length,
-        eval=usual.eval,
-        checkpoint=usual.checkpoint,
-        log=usual.log,
-        runtime=replace(config.runtime, compile_cache=usual.runtime.compile_cache),
-    )
+def _kept(programs: OrderedDict[Any, Any], key: Any) -> Any:
+    """The entry of a key, now the last to go; the oldest beyond `_KEPT` are let go."""
+    programs.move_to_end(key)
+    while len(programs) > _KEPT:
+        programs.popitem(last=False)
+    return programs[key]
 
 
 def forget_programs() -> None:
     """Lets go of all that was kept for later sessions: their memory, and code that has changed."""
-    _parts.clear()
+    with _lock:
+        _parts.clear()
 
 
 class Session:
@@ -160,10 +151,8 @@ class Session:
         return self.algorithm.agent
 
     def agent_of(self, adapt: str) -> Agent:
-        """The agent that adapts by the belief (`posterior`) or by `search`."""
-        agent = self.algorithm.searching if adapt == "search" else self.algorithm.agent
-        assert agent is not None  # `options.check_run` has looked
-        return agent
+        """The agent of a name that `AlgorithmRules.ways` has, else the default one."""
+        return self.algorithm.agents.get(adapt, self.algorithm.agent)
 
     def placements(
         self, goal_set: str, goals: int, tasks: Sequence[str] | None = None
@@ -202,12 +191,16 @@ class Session:
         kind = lanes, horizon or self.config.env.horizon, policies, adapt
         agent = self.agent_of(adapt)
         kept = self._parts.evaluators
-        if self.env is not self._parts.env or kind not in kept:
-            made = Evaluator(self.config, self.env, agent, lanes, horizon, policies)
-            if self.env is not self._parts.env:
-                return made
-            kept[kind] = made
-        return kept[kind]
+        with _lock:
+            if kind not in kept:
+                kept[kind] = Evaluator(self.config, self.env, agent, lanes, horizon, policies)
+            return _kept(kept, kind)
+
+    def forget(self, evaluator: Evaluator) -> None:
+        """Lets an evaluator go that is not to be used again."""
+        with _lock:
+            for kind in [k for k, kept in self._parts.evaluators.items() if kept is evaluator]:
+                del self._parts.evaluators[kind]
 
     def training(self, mesh: Any) -> TrainingProgram:
         """The training iteration over a mesh of devices, traced and not yet compiled."""

@@ -101,7 +101,8 @@ def sweep(
         print(f"{len(targets)} checkpoints, {progress.total:,} cells to run, {held:,} there")
         comparison = None
         try:
-            for _, group in itertools.groupby(sorted(targets, key=program_key), program_key):
+            key = lambda target: program_key(target, options.adapt)
+            for _, group in itertools.groupby(sorted(targets, key=key), key):
                 members = list(group)
                 evaluate_group({t: todo[t] for t in members if todo[t]}, options, table, progress)
                 if compare is not None and comparison is None:
@@ -166,6 +167,7 @@ def compiled_evaluator(
         if smaller == plan:
             break
         print(f"memory is short: {evaluator.memory_bytes() / 2**30:.1f} GiB needed")
+        session.forget(evaluator)
         plan = smaller
     progress.compile_seconds += time.monotonic() - started
     return evaluator

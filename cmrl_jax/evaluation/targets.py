@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from cmrl_jax.config.schema import Config, ConfigError, leaves
 from cmrl_jax.evaluation.cells import CellTable
-from cmrl_jax.evaluation.options import DONATED, EvalOptions, evaluated_tasks
+from cmrl_jax.evaluation.options import DONATED, EvalOptions, evaluated_tasks, ks_of
 from cmrl_jax.evaluation.session import Policy, Session, load_policy
 from cmrl_jax.evaluation.settings import cell_columns, settings
 from cmrl_jax.evaluation.trials import evaluation_config
@@ -50,12 +50,12 @@ def targets_of(
         steps = list(checkpoints)
     elif checkpoints == "last":
         steps = steps[-1:]
-    k = options.k if options.k is not None else config.eval.final_k
+    k = ks_of(options, config)
     tasks = sorted(evaluated_tasks(options, config), key=task_names().index)
     return [Target(run, step, config, k, tuple(tasks)) for step in steps]
 
 
-def program_key(target: Target) -> str:
+def program_key(target: Target, adapt: str = "posterior") -> str:
     """Targets of one key are scored by one compiled program, and adapt equally often.
 
     The key is the whole configuration less what is known not to act, so that a key of the schema
@@ -65,7 +65,8 @@ def program_key(target: Target) -> str:
     rules = rules_of(config)
     idle = (*IDLE, *rules.IDLE)
     acting = [(name, value) for name, _, value in leaves(config) if not _is_idle(name, idle)]
-    told = config.tasks.train if rules.is_told_the_task else ()
+    # A search's arms are the training tasks' sentences.
+    told = config.tasks.train if rules.is_told_the_task or adapt == "search" else ()
     return repr((acting, told, target.k))
 
 

@@ -15,7 +15,7 @@ from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.evaluation.controls import text_per_goal
 from cmrl_jax.evaluation.evaluator import Trial
-from cmrl_jax.evaluation.options import EvalOptions
+from cmrl_jax.evaluation.options import EvalOptions, ks_of
 from cmrl_jax.evaluation.session import Policy, Session
 from cmrl_jax.registry import other_task
 from cmrl_jax.text.goals import GoalTable, load_goals
@@ -114,6 +114,9 @@ def trial_of(
     Raises:
         ConfigError: a sentence that cannot be had, or a goal set that cannot be read.
     """
+    if options.adapt == "search":  # whose arms are the sentences that lie here now
+        for policy in policies:
+            _table(policy, session.config, options, session.config.tasks.train)
     texts = [task_sentences(policy, session.config, options, tasks) for policy in policies]
     return Trial(
         tasks=tasks,
@@ -135,13 +138,13 @@ def adaptation_goals(
     """
     if options.protocol == "goal":
         return None
-    k = options.k if options.k is not None else session.config.eval.final_k
+    k = ks_of(options, session.config)
     goals = session.placements("train", GOALS, tasks)
     orders = [
         np.random.default_rng([options.seed, draw]).permutation(goals.shape[1])
         for draw in range(options.draws)
     ]
-    turns = np.arange(max(max(k), 1)) % goals.shape[1]
+    turns = np.arange(max(*k, 1)) % goals.shape[1]
     return goals[:, np.stack(orders)[:, turns]]
 
 

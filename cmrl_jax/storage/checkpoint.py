@@ -323,7 +323,7 @@ def policy_digest(run: Path, step: int) -> str:
 
 
 def split_run(run: Any) -> dict[str, Any]:
-    """The items of `full_store` that hold a `collect.RunState`, or the shapes of one."""
+    """The items of `full_store` that hold a `RunState`, or the shapes of one."""
     learner = {"state": run.learner, "key": run.key, "iteration": run.iteration}
     return {"learner": learner, "replay": run.replay, "context": run.context}
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from cmrl_jax.commands import command
 from cmrl_jax.config.schema import GOAL_ABLATIONS, ConfigError, call_envs
-from cmrl_jax.registry import tasks_beside
+from cmrl_jax.registry import other_task, tasks_beside
 from cmrl_jax.text.goal_files import find_table
 from envs.command_line import suggest
 from envs.tasks import METAWORLD_TASKS
@@ -96,10 +96,10 @@ def load_goals(table: str, tasks: tuple[str, ...] | None = None) -> GoalTable:
             heldout_vectors=np.zeros_like(text.heldout_vectors),
         )
     elif table == "shuffled":
-        # Each task takes the next one's: open-drawer words for window-close. No task keeps its own,
-        # and unlike a swap of verbs or of objects it breaks what two tasks on one object share.
-        rows = np.roll(np.arange(len(text.tasks)), -1)
-        text = replace(text.select([text.tasks[row] for row in rows]), tasks=text.tasks)
+        # Each task takes another's: open-drawer words for window-close. No task keeps its own, and
+        # unlike a swap of verbs or of objects it breaks what two tasks on one object share.
+        others = call_envs(lambda: [other_task(task) for task in text.tasks])
+        text = replace(text.select(others), tasks=text.tasks)
     if table in GOAL_ABLATIONS:
         text = _ablation(replace(text, encoder=table, revision=""))
     return text.select(tasks or text.tasks)

@@ -254,22 +254,26 @@ class _Run:
         is_strict = jax.config.jax_debug_nans or jax.config.jax_debug_infs
         config, iteration = self.config, row["iteration"]
         kept = f"{self.full.directory} keeps iteration {self.full.steps()[-1]}"
-        skipped, faults = row.get("train/skipped") or 0.0, int(row["train/physics_faults"])
+        skipped = row.get("train/skipped") or 0.0
+        faults = int(row.get("train/physics_faults") or 0)
         if skipped == 1.0 or (skipped and is_strict):
             share = (
                 "every gradient was" if skipped == 1.0 else f"{skipped:.1%} of the gradients were"
             )
             raise ConfigError(
                 f"iteration {iteration}: {share} non-finite",
-                f"start a new run with a lower sac.lr; {kept}",
+                f"{rules_of(config).on_bad_gradients}; {kept}",
             )
         # As many as a whole task collects: what is learned from is no longer the task.
         if faults >= lanes_per_task(config) * config.env.horizon or (faults and is_strict):
             other = "native" if config.env.physics == "mjx" else "mjx"
+            cure = f"start a new run without the last change; {kept}"
+            if config.env.name == "ml4":
+                cure = cure.replace("without", f"with env.physics: {other}, or without")
             raise ConfigError(
                 f"iteration {iteration}: the physics of {faults} of "
                 f"{self.schedule.steps_per_iteration} control steps was non-finite",
-                f"start a new run with env.physics: {other}, or without the last change; {kept}",
+                cure,
             )
         if skipped:
             self.say(f"warning: {skipped:.1%} of the gradients were non-finite and were skipped")

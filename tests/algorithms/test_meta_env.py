@@ -53,8 +53,10 @@ METHODS = {
 @pytest.fixture(scope="module", autouse=True)
 def registered():
     cj.register_environment("point", point_env.TASKS, "point_env:make")
+    cj.register_algorithm("linear", "linear_search:make", "linear_search:Rules")
     yield
     del registry.ENVIRONMENTS["point"]
+    del registry.ALGORITHMS["linear"]
 
 
 @pytest.mark.parametrize("method", [pytest.param("cmrl", marks=pytest.mark.slow), "pearl", "sac"])
@@ -66,6 +68,36 @@ def test_it_is_learned(method, tmp_path):
     k = max(row["k"] for row in rows)
     last = [row["success_last"] for row in rows if row["k"] == k]
     assert len(last) == len(overrides["tasks.train"]) and min(last) >= 0.8
+
+
+LINEAR = SMALL | ONE | {"algorithm": "linear", "collect.lanes": 64, "train.env_steps": 25_600}
+LINEAR |= {"eval.k": [0], "eval.final_k": [0], "goals.table": "one-hot"}
+
+
+def test_another_algorithm_trains_resumes_and_is_evaluated(tmp_path):
+    """One that shares nothing with CMRL but the interfaces, from the registry to eval.json."""
+    config = cj.load_config("smoke", LINEAR)
+    whole = cj.train(config, tmp_path / "whole", loggers=[])
+    figures = whole.evaluation["point-right"]["0"]
+    assert figures["success_last"] >= 0.9 and whole.iteration == 20
+    stop = cj.Stop()
+
+    class Stopper(cj.Logger):
+        def row(self, row, progress):
+            if row["iteration"] == 6:
+                stop.request()
+
+    half = cj.train(config, tmp_path / "half", loggers=[Stopper()], stop=stop)
+    assert half.iteration == 7 and half.evaluation is None
+    again = cj.train(config, tmp_path / "half", resume=True, loggers=[])
+    shown = lambda rows: [{n: x for n, x in row.items() if "_s" not in n} for row in rows]
+    assert shown(again.metrics) == shown(whole.metrics)
+    scored = cj.evaluate(cj.load_agent(tmp_path / "half"), goals=10)
+    assert scored.rows()[0]["success_last"] >= 0.9
+    with pytest.raises(cj.ConfigError, match="--k 2 with algorithm linear"):
+        cj.evaluate(again.agent, k=(2,))
+    with pytest.raises(cj.ConfigError, match="--adapt search with algorithm linear"):
+        cj.evaluate(again.agent, adapt="search")
 
 
 def walk(env, steps, restart=None, begun=0):
@@ -100,6 +132,16 @@ def test_collection_begins_anew_after_a_fall():
     assert fell.sum(0).tolist() == [2, 3]  # step 7, then every 7: 0.1 + 7 * 0.15 > 1
     np.testing.assert_allclose(transitions.obs[7, 0, :2], [0.1, 0.0])
     assert (transitions.next_obs[6, 0, 0] > 1) and transitions.truncated[-1].all()
+
+
+def test_faults_are_counted_across_falls(monkeypatch):
+    step = PointEnv.step
+    faulty = lambda self, state, action: step(self, state, action).replace(faults=state.faults + 1)
+    monkeypatch.setattr(PointEnv, "step", faulty)
+    env = PointEnv()
+    fresh = lambda key: jax.vmap(env.reset_to)(jnp.array([1, 1]), jnp.array([[0.1, 0.0]] * 2))
+    _, stats = walk(env, HORIZON, fresh)
+    assert stats.faults.sum(0).tolist() == [HORIZON, HORIZON]
 
 
 def test_what_comes_after_a_fall_does_not_count():
@@ -158,4 +200,4 @@ def test_an_environment_and_its_tasks_have_names_of_their_own():
         cj.load_config("smoke", SMALL | {"tasks.train": ["window-open"]})
     with pytest.raises(cj.ConfigError, match="unknown algorithm 'cmlr'") as error:
         cj.load_config("smoke", {"algorithm": "cmlr"})
-    assert error.value.cure == "did you mean 'cmrl'? valid: cmrl"
+    assert error.value.cure == "did you mean 'cmrl'? valid: cmrl, linear"

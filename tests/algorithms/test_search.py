@@ -93,6 +93,25 @@ def test_rounds_halve_what_is_left():
     assert round_starts(12) == (0, 12, 16, 18, 19, 20)
     assert round_starts(16) == (0, 16, 18, 19, 20)
     assert round_starts(20) == (0, 20) and round_starts(24) == (0, 24)
+    for arms in range(1, 20):
+        starts = round_starts(arms)
+        assert starts[-1] == BUDGET and starts[1] == arms
+        sizes = np.diff(starts[1:])
+        assert (sizes >= 1).all() and (sizes <= max(arms // 2, 1)).all()
+
+
+@pytest.mark.parametrize("tasks", [1, 2, 3])
+def test_few_arms_are_searched_to_the_end(made, params, tasks):
+    """Without mirrors there are 2 to 4: every exploring episode is credited to one of them."""
+    identity = np.ones((1, OBS), np.float32), np.ones((1, ACT), np.float32)
+    trial = Trial(made, params, lambda lane, arm: np.full(STEPS, float(arm == tasks)))
+    trial.agent = SearchAgent(made.learner, STEPS, GOALS[:tasks, 0], identity)
+    trial.memory = trial.agent.init(TOLD)
+    trial.begin, trial.observe = jax.jit(trial.agent.begin_episode), trial.agent.observe
+    for _ in range(BUDGET + 3):
+        assert (trial.play() <= tasks).all()
+    assert (trial.play(exploit=True) == tasks).all()
+    assert (trial.memory.plays.sum(-1) == BUDGET + 2).all()  # the last is credited when it is over
 
 
 def test_an_episode_that_counts_takes_the_best_arm_and_teaches_nothing(made, params):
@@ -132,6 +151,18 @@ def test_a_step_that_is_masked_earns_nothing(made, params):
     mask[1, 3:] = 0
     after = agent.observe(params, memory, transitions(reward), jnp.asarray(mask))
     np.testing.assert_array_equal(after.score, [STEPS, 3, STEPS])
+
+
+def test_a_window_with_a_masked_step_is_no_peak(made, params):
+    """Rewards of -3, then -1; of the second window one step is masked in lane 1, all in lane 2."""
+    agent = agent_of(made)
+    memory = agent.init(TOLD)
+    reward = np.full((LANES, STEPS + 2), -3.0, np.float32)
+    reward[:, 5:10] = -1.0
+    mask = np.ones_like(reward)
+    mask[1, 7], mask[2] = 0, 0
+    after = agent.observe(params, memory, transitions(reward), jnp.asarray(mask))
+    np.testing.assert_array_equal(after.score, [-1, -3, -np.inf])
 
 
 def test_an_arm_is_a_sentences_z_in_a_mirror(made, params):

@@ -1,5 +1,6 @@
 """Flags of `eval` and `sweep`: what they hand on, and their mistakes."""
 
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -61,6 +62,31 @@ def make_run(path: Path, config: str = "ml4.yaml") -> None:
         ),
         (["eval", "--run", "x", "--text", ""], "--text is empty", "--text-control zero"),
         (["sweep", "--runs", "x", "--text", " \t"], "--text is empty", "write a sentence"),
+        (
+            ["eval", "--run", "x", "--protocol", "task", "--goal-set", "train"],
+            "--protocol task with --goal-set train",
+            "name another",
+        ),
+        (
+            ["eval", "--run", "x", "--protocol", "task", "--z", "shuffled"],
+            "--protocol task with --z shuffled",
+            "--protocol goal",
+        ),
+        (
+            ["eval", "--run", "x", "--protocol", "task", "--paraphrases", "heldout"],
+            "--protocol task with --paraphrases heldout",
+            "--protocol goal",
+        ),
+        (
+            ["eval", "--run", "x", "--protocol", "task", "--physics", "metaworld"],
+            "--protocol task with --physics metaworld",
+            "--physics native",
+        ),
+        (
+            ["sweep", "--runs", "x", "--adapt", "search", "--compare", "2"],
+            "--compare with --adapt",
+            "leave --compare out",
+        ),
         (["sweep"], "required: --runs", "--help"),
         (["sweep", "--runs", "x*"], "--runs x* matches no run", "runs/ml4-*"),
         (["sweep", "--runs", "x", "--checkpoints", "first"], "--checkpoints is 'first'", "all"),
@@ -106,6 +132,36 @@ def test_eval_hands_over_its_flags(calls, here):
     }  # fmt: skip
     assert calls[2]["options"] == EvalOptions(text="shut it", weights=Path("w"))
     assert not (here / "out").exists()  # tried, and left to the command to make
+
+
+def test_every_flag_changes_its_option(calls, here):
+    """None is parsed and then left behind."""
+    make_run(here / "r", "ml4-grounded.yaml")
+    given = {
+        "k": "3", "tasks": "window-open", "goals": "3", "goal_set": "fresh:3", "seed": "3",
+        "horizon": "3", "physics": "native", "policy": "sampled", "z": "prior", "lanes": "3",
+        "adapt": "search", "protocol": "task", "text_control": "zero", "paraphrases": "heldout",
+        "text": "shut it", "weights": ".", "draws": "3",
+    }  # fmt: skip
+    named = {field.name for field in fields(EvalOptions)}
+    episodes = {"adaptation_episodes", "evaluation_episodes"}
+    assert named - episodes == {*given, "any_table"}
+    for name, word in given.items():
+        flag = "eval-seeds" if name == "draws" else name.replace("_", "-")
+        assert main(["eval", "--run", "r", f"--{flag}", word]) == 0
+        old, new = asdict(EvalOptions()), asdict(calls[-1]["options"])
+        assert {n for n in named if old[n] != new[n]} == {name}
+    for flag in episodes:
+        words = [f"--{flag.replace('_', '-')}", "7", "--physics", "metaworld"]
+        assert main(["eval", "--run", "r", *words]) == 0
+        assert getattr(calls[-1]["options"], flag) == 7
+
+
+def test_a_search_needs_arms(calls, refused, here):
+    make_run(here / "p", "pearl.yaml")
+    cause, cure = refused("eval", "--run", "p", "--adapt", "search")
+    assert cause == "--adapt search with encoder.goal_fusion none (p)"
+    assert cure == "leave it out, or use one of: posterior"
 
 
 def test_sweep_hands_over_its_flags(calls, refused, here, replace_module):

@@ -2,6 +2,7 @@
 
 import pytest
 
+from cmrl_jax import registry
 from cmrl_jax.config.files import load_config
 from cmrl_jax.evaluation.session import Session, forget_programs
 
@@ -56,10 +57,20 @@ def test_what_shapes_a_program_makes_another(key):
     assert session(**{key: OTHER[key]}).algorithm is not session().algorithm
 
 
-def test_an_environment_of_ones_own_is_never_kept():
+def test_another_entry_of_the_registry_makes_another(monkeypatch):
+    before, entries = session(), registry.ALGORITHMS
+    again = registry.AlgorithmEntry(entries["cmrl"].make, entries["cmrl"].rules)
+    monkeypatch.setitem(entries, "cmrl", again)
+    assert session().algorithm is not before.algorithm
+
+
+def test_an_evaluator_can_be_let_go():
     one = session()
-    kept, one.env = one.evaluator(8), session(**{"env.obs_mode": "canonical"}).env
-    assert one.evaluator(8) is not kept and session().evaluator(8) is kept
+    refused = one.evaluator(8)
+    one.forget(refused)
+    assert session().evaluator(8) is not refused
+    many = [one.evaluator(lanes) for lanes in range(1, 7)]
+    assert one.evaluator(6) is many[-1] and one.evaluator(1) is not many[0]
 
 
 def test_a_few_are_kept_and_they_can_be_let_go():

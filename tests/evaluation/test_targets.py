@@ -151,6 +151,16 @@ def test_a_program_is_named_by_all_that_is_not_known_to_be_idle(twins):
     assert not idle_keys(told, ["tasks.train"])
 
 
+def test_folds_are_searched_each_by_its_own_program():
+    """A search's arms are the training tasks' sentences, which two folds have not in common."""
+    config = small_config()
+    other = replace(config, tasks=replace(config.tasks, train=config.tasks.train[:2], test=()))
+    keys = lambda adapt: [
+        program_key(Target(Path("r"), 1, c, (0,), ("window-open",)), adapt) for c in (config, other)
+    ]
+    assert len(set(keys("search"))) == 2 and len(set(keys("posterior"))) == 1
+
+
 def test_what_is_idle_changes_no_program(twins):
     """Every idle key changed at once: the traced episode is the same, to the last operation."""
     config = small_config()

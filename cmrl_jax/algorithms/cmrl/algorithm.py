@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import jax
 
-from cmrl_jax.algorithms.base import Algorithm, RunState
+from cmrl_jax.algorithms.base import Agent, Algorithm, RunState
 from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
 from cmrl_jax.algorithms.cmrl.learner import Learner
@@ -30,15 +30,15 @@ def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
     def gradient_steps(run: RunState) -> jax.Array:
         return run.learner.gradient_steps
 
-    searching = None
-    if learner.inference is not None:
-        searching = SearchAgent(learner, config.collect.chunk, goal_vectors[:, 0], env.symmetries)
+    agents: dict[str, Agent] = {"posterior": CmrlAgent(learner, config.collect.chunk)}
+    if learner.inference is not None and learner.inference.has_goal_factor:
+        sentences = goal_vectors[:, 0]
+        agents["search"] = SearchAgent(learner, config.collect.chunk, sentences, env.symmetries)
     return Algorithm(
-        agent=CmrlAgent(learner, config.collect.chunk),
+        agents=agents,
         init=lambda key: init_run(config, env, learner, key),
         make_iteration=make_iteration,
         policy_params=policy_params,
         gradient_steps=gradient_steps,
-        searching=searching,
         parts=learner,
     )

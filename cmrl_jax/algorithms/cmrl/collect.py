@@ -141,7 +141,7 @@ class TrainIteration:
         run = run.replace(key=key)
         chunks = horizon // collect.chunk
         keys = jax.random.split(k_chunks, chunks)
-        (run, state), (metrics, reward, terminated, stats) = jax.lax.scan(
+        (run, _), (metrics, reward, terminated, stats) = jax.lax.scan(
             chunk,
             (run, self.reset_lanes(k_reset)),
             (jnp.arange(chunks), keys, noise.reshape(chunks, collect.chunk, *shape)),
@@ -154,7 +154,7 @@ class TrainIteration:
         if self.learner.inference is not None:
             for index, name in enumerate(LANE_GROUPS):
                 metrics[f"episodes_{name}"] = jnp.sum(actual_source == index).astype(jnp.float32)
-        metrics["physics_faults"] = jnp.sum(state.faults).astype(jnp.float32)
+        metrics["physics_faults"] = jnp.sum(stats.faults).astype(jnp.float32)
         denominator = normalizers.reward_denominator(run.learner.return_stats, config.sac)
         metrics["reward_denominator"] = denominator
         metrics |= self.diagnose(run.learner, run.replay, run.context, k_diagnose)
@@ -239,7 +239,10 @@ class TrainIteration:
     def episode_metrics(
         self, reward: jax.Array, stats: StepStats, terminated: jax.Array
     ) -> dict[str, jax.Array]:
-        """Figures of each lane's first episode, means per task, from (time, task, lane)."""
+        """Means per task of each lane's first episode, from (time, task, lane).
+
+        `late_reward` is of the iteration's last steps, whichever episode they belong to.
+        """
         figures = episode_figures(reward, stats, terminated if self.env.can_terminate else None)
         mean = lambda x: jnp.mean(x, -1, dtype=jnp.float32)
         return {

@@ -6,24 +6,14 @@ PEARL, MTSAC and SAC are configurations of CMRL: `model.conditioning` is z, task
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
-from cmrl_jax.config.rules import require
-from cmrl_jax.config.schema import LARGEST_RING, Config, lanes_per_task
+from cmrl_jax.algorithms.rules import AlgorithmRules
+from cmrl_jax.config.schema import LARGEST_RING, Config, lanes_per_task, require
 
 
-class Rules:
-    """Answers about one configuration; another algorithm's rules have the same attributes.
-
-    Attributes:
-        adapts: whether own episodes change what its policy does.
-        searches: whether it has an agent that adapts by search.
-        reads_text: whether its policy is told a sentence.
-        is_told_the_task: whether it is told which of its training tasks it acts on.
-        can_start_from_text: whether the sentence alone says something before any episode.
-        kind: what the answers come from, in words for a message.
-        IDLE: keys, and with a dot whole sections, that training reads and a policy that acts does
-            not.
-    """
+class Rules(AlgorithmRules):
+    """Answers about one CMRL configuration, see `AlgorithmRules`."""
 
     IDLE = (
         "kl.",
@@ -56,25 +46,33 @@ class Rules:
     )
 
     def __init__(self, config: Config):
-        self._config = config
+        super().__init__(config)
         conditioning, fusion = config.model.conditioning, config.encoder.goal_fusion
         self.adapts = conditioning == "z"
-        self.searches = self.adapts
         self.reads_text = self.adapts and fusion != "none"
         self.can_start_from_text = self.adapts and fusion in ("factor", "both")
+        self.ways = ("posterior", "search") if self.can_start_from_text else ("posterior",)
         self.is_told_the_task = conditioning == "task_id"
         self.kind = f"model.conditioning {conditioning}"
         if self.adapts:
             self.kind = f"encoder.goal_fusion {fusion}"
 
+    on_bad_gradients = "start a new run with a lower sac.lr"
+
+    def shaping(self) -> Config:
+        """Beside what no algorithm's programs depend on: the seed, and how long a run is."""
+        config, usual = super().shaping(), Config()
+        length = replace(config.train, env_steps=usual.train.env_steps, minutes=usual.train.minutes)
+        return replace(config, seed=usual.seed, train=length)
+
     def check(self) -> None:
         """Raises ConfigError for the first combination that cannot be trained."""
-        _check_model(self._config)
-        _check_sizes(self._config)
+        _check_model(self.config)
+        _check_sizes(self.config)
         self._check_adaptation()
 
     def _check_adaptation(self) -> None:
-        config = self._config
+        config = self.config
         if self.adapts:
             return
         cause = f"tasks.test is {list(config.tasks.test)} with {self.kind}"
@@ -86,7 +84,7 @@ class Rules:
 
     def check_devices(self, devices: int) -> None:
         """Raises ConfigError unless lanes, rings and batches divide evenly among the devices."""
-        _check_devices(self._config, devices)
+        _check_devices(self.config, devices)
 
 
 def lane_groups(config: Config) -> tuple[int, int, int]:

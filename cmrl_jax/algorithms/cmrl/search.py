@@ -60,7 +60,8 @@ class SearchMemory:
 def round_starts(arms: int, budget: int = BUDGET) -> tuple[int, ...]:
     """After how many exploring episodes each round of the halving begins.
 
-    The first tries every arm; each later one spends half of what is left, at least one episode.
+    The first tries every arm; each later one spends half of what is left on at most half of the
+    arms, at least one episode.
 
     Returns:
         Ascending numbers from 0; the last is the end of the last round.
@@ -69,7 +70,7 @@ def round_starts(arms: int, budget: int = BUDGET) -> tuple[int, ...]:
     done = arms
     while left > 0:
         starts.append(done)
-        size = max(1, min(left, left // 2))
+        size = max(1, min(left // 2, arms // 2))
         done, left = done + size, left - size
     return (*starts, done)
 
@@ -80,12 +81,12 @@ class SearchAgent:
 
     Args:
         learner: with a latent.
-        chunk: control steps between two calls of `observe`, a multiple of `PEAK_STEPS`, or 1.
+        chunk: control steps between two calls of `observe`.
         sentences: text vectors of the training tasks (task, G).
         symmetries: signs of observations (symmetry, obs) and of actions (symmetry, act), the
             identity first.
-        rule: what an episode is scored by: its return, or the largest mean reward of `PEAK_STEPS`
-            steps.
+        rule: what an episode is scored by: its return, or the largest mean reward of a window of
+            `PEAK_STEPS` steps; windows lie end to end from each observed stretch's first step.
     """
 
     learner: Learner
@@ -99,7 +100,7 @@ class SearchAgent:
 
     @property
     def arms(self) -> int:
-        """Their number; arm a is sentence a mod S, the task's own first, in mirror a div S."""
+        """Their number; arm a is sentence a mod N of N, the task's own first, in mirror a div N."""
         return (1 + len(self.sentences)) * len(self.symmetries[0])
 
     def init(self, told: Told) -> SearchMemory:
@@ -166,12 +167,14 @@ class SearchAgent:
     def observe(
         self, params: PolicyParams, memory: SearchMemory, transitions: Transition, mask: jax.Array
     ) -> SearchMemory:
-        reward = transitions.reward * mask
+        reward, counts = transitions.reward, mask > 0
         if self.rule == "return":
-            return replace(memory, score=memory.score + jnp.sum(reward, -1))
-        lanes, time = reward.shape
-        steps = PEAK_STEPS if time % PEAK_STEPS == 0 else 1
-        peak = jnp.max(jnp.mean(reward.reshape(lanes, -1, steps), -1), -1)
+            return replace(memory, score=memory.score + jnp.sum(reward, -1, where=counts))
+        steps = min(PEAK_STEPS, self.chunk)
+        short = -reward.shape[1] % steps  # steps that the last window lacks, and that spoil it
+        window = lambda x: jnp.pad(x, ((0, 0), (0, short))).reshape(len(x), -1, steps)
+        whole = jnp.all(window(counts), -1)
+        peak = jnp.max(jnp.where(whole, jnp.mean(window(reward), -1), -jnp.inf), -1)
         return replace(memory, score=jnp.maximum(memory.score, peak))
 
     def _order(self, memory: SearchMemory) -> jax.Array:

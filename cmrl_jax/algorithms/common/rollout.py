@@ -26,6 +26,7 @@ class StepStats(NamedTuple):
 
     success: jax.Array  # bool, at that very step
     distance: jax.Array  # the quantity success is judged by
+    faults: jax.Array  # int32, times the simulation was put back in that step
 
 
 def rollout(
@@ -59,6 +60,7 @@ def rollout(
     def step(state: Any, inputs: tuple[jax.Array, jax.Array, jax.Array | None]):
         time, key, step_noise = inputs
         k_act, k_uniform = jax.random.split(key)
+        k_restart = jax.random.fold_in(key, 2)  # beside the two above
         action = act(state.obs, k_act, step_noise)
         uniform = jax.random.uniform(k_uniform, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(random_actions, uniform, action)
@@ -73,9 +75,9 @@ def rollout(
             first=state.steps == 0,
             next_obs=new.obs,
         )
-        stats = StepStats(new.success, new.distance)
+        stats = StepStats(new.success, new.distance, new.faults - state.faults)
         if env.can_terminate and restart is not None:
-            new = select_lanes(terminated, restart(jax.random.fold_in(key, 0)), new)
+            new = select_lanes(terminated, restart(k_restart), new)
         return new, (transition, stats)
 
     inputs = (begun + jnp.arange(steps), jax.random.split(key, steps), noise)
@@ -107,12 +109,12 @@ def episode_figures(
         reward: (time, ...), as are the others, any axes of lanes.
         terminated: what comes after the first True does not count; None: nothing terminates.
     """
-    success, distance = stats
+    success, distance, _ = stats
     if terminated is None:
         last = lambda x: x[-1]
     else:
         counts = is_before_the_end(terminated)
-        reward, success = reward * counts, success & counts
+        reward, success = jnp.where(counts, reward, 0.0), success & counts
         end = jnp.sum(counts, 0, dtype=jnp.int32) - 1
         last = lambda x: jnp.take_along_axis(x, end[None], 0)[0]
     return EpisodeFigures(

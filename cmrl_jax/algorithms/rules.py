@@ -1,0 +1,54 @@
+"""What the program asks of a configuration's algorithm before jax is imported."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from cmrl_jax.config.schema import Config
+
+
+class AlgorithmRules:
+    """Answers about one configuration; an algorithm's own rules override what differs.
+
+    Attributes:
+        adapts: whether own episodes change what its policy does.
+        ways: names of its agents (`Algorithm.agents`), by what own episodes change; the first is
+            the default.
+        reads_text: whether its policy is told a sentence.
+        is_told_the_task: whether it is told which of its training tasks it acts on.
+        can_start_from_text: whether the sentence alone says something before any episode.
+        kind: what the answers come from, in words for a message.
+        on_bad_gradients: what to do about a run whose gradients are not finite.
+        IDLE: keys, and with a dot whole sections, that training reads and a policy that acts does
+            not.
+    """
+
+    IDLE: tuple[str, ...] = ()
+    adapts = False
+    ways: tuple[str, ...] = ("none",)
+    reads_text = False
+    is_told_the_task = False
+    can_start_from_text = False
+    on_bad_gradients = "start a new run with a lower learning rate"
+
+    def __init__(self, config: Config):
+        self.config = config
+        self.kind = f"algorithm {config.algorithm}"
+
+    def shaping(self) -> Config:
+        """The configuration with what no program depends on at its default."""
+        config, usual = self.config, Config()
+        return replace(
+            config,
+            name=usual.name,
+            eval=usual.eval,
+            checkpoint=usual.checkpoint,
+            log=usual.log,
+            runtime=replace(config.runtime, compile_cache=usual.runtime.compile_cache),
+        )
+
+    def check(self) -> None:
+        """Raises ConfigError for the first combination that cannot be trained."""
+
+    def check_devices(self, devices: int) -> None:
+        """Raises ConfigError unless the work divides evenly among the devices."""
