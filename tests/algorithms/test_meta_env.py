@@ -78,8 +78,9 @@ def test_another_algorithm_trains_resumes_and_is_evaluated(tmp_path):
     """One that shares nothing with CMRL but the interfaces, from the registry to eval.json."""
     config = cj.load_config("smoke", LINEAR)
     whole = cj.train(config, tmp_path / "whole", loggers=[])
-    figures = whole.evaluation["point-right"]["0"]
-    assert figures["success_last"] >= 0.9 and whole.iteration == 20
+    assert whole.evaluation is not None and whole.iteration == 20
+    # A fall at once is worth 4.4, staying on the plateau 9.4 (and a fall at the very end more).
+    assert whole.evaluation["point-right"]["0"]["return"] >= 8.0
     stop = cj.Stop()
 
     class Stopper(cj.Logger):
@@ -93,7 +94,7 @@ def test_another_algorithm_trains_resumes_and_is_evaluated(tmp_path):
     shown = lambda rows: [{n: x for n, x in row.items() if "_s" not in n} for row in rows]
     assert shown(again.metrics) == shown(whole.metrics)
     scored = cj.evaluate(cj.load_agent(tmp_path / "half"), goals=10)
-    assert scored.rows()[0]["success_last"] >= 0.9
+    assert scored.rows()[0]["return"] >= 8.0
     with pytest.raises(cj.ConfigError, match="--k 2 with algorithm linear"):
         cj.evaluate(again.agent, k=(2,))
     with pytest.raises(cj.ConfigError, match="--adapt search with algorithm linear"):

@@ -10,7 +10,7 @@ from learner_fixtures import ACT, GOALS, LATENT, OBS, TASKS, build, tiny_config
 
 from cmrl_jax.algorithms.base import Told
 from cmrl_jax.algorithms.cmrl.agent import PolicyParams
-from cmrl_jax.algorithms.cmrl.search import BUDGET, SearchAgent, round_starts
+from cmrl_jax.algorithms.cmrl.search import BUDGET, Rule, SearchAgent, round_starts
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.nn.context import init_belief
 
@@ -35,7 +35,7 @@ def params(made):
     return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
 
 
-def agent_of(made, rule="peak"):
+def agent_of(made, rule: Rule = "peak"):
     return SearchAgent(made.learner, STEPS, GOALS[:, 0], MIRRORS, rule)
 
 
@@ -49,7 +49,7 @@ def transitions(reward):
 class Trial:
     """Episodes one after the other, whose rewards are a function of the arm."""
 
-    def __init__(self, made, params, value, rule="peak"):
+    def __init__(self, made, params, value, rule: Rule = "peak"):
         self.agent, self.params, self.value = agent_of(made, rule), params, value
         self.memory = self.agent.init(TOLD)
         self.begin = jax.jit(self.agent.begin_episode)
@@ -59,7 +59,8 @@ class Trial:
         """One episode; the arm of each lane (lane,)."""
         keys = jax.random.split(jax.random.key(0), LANES)
         memory = self.begin(self.params, self.memory, self.memory, keys, np.bool_(exploit))
-        reward = np.float32([self.value(lane, int(arm)) for lane, arm in enumerate(memory.arm)])
+        rewards = [self.value(lane, int(arm)) for lane, arm in enumerate(memory.arm)]
+        reward = np.array(rewards, np.float32)
         after = self.observe(
             self.params, memory, transitions(reward), jnp.ones(reward.shape, jnp.float32)
         )
@@ -107,7 +108,7 @@ def test_few_arms_are_searched_to_the_end(made, params, tasks):
     trial = Trial(made, params, lambda lane, arm: np.full(STEPS, float(arm == tasks)))
     trial.agent = SearchAgent(made.learner, STEPS, GOALS[:tasks, 0], identity)
     trial.memory = trial.agent.init(TOLD)
-    trial.begin, trial.observe = jax.jit(trial.agent.begin_episode), trial.agent.observe
+    trial.begin = jax.jit(trial.agent.begin_episode)
     for _ in range(BUDGET + 3):
         assert (trial.play() <= tasks).all()
     assert (trial.play(exploit=True) == tasks).all()
@@ -137,7 +138,8 @@ def test_the_rule_decides_what_is_best(made, params):
             reward[STEPS // 2 :] = 9.0
         return reward
 
-    for rule, best in (("return", 1), ("peak", 6)):
+    by_rule: dict[Rule, int] = {"return": 1, "peak": 6}
+    for rule, best in by_rule.items():
         trial = Trial(made, params, value, rule)
         for _ in range(ARMS):
             trial.play()
@@ -168,8 +170,8 @@ def test_a_window_with_a_masked_step_is_no_peak(made, params):
 def test_an_arm_is_a_sentences_z_in_a_mirror(made, params):
     """Action of arm (sentence, mirror) = mirrored action of the policy, told z, on mirrored obs."""
     agent, learner = agent_of(made), made.learner
-    obs = np.random.default_rng(0).normal(size=(LANES, OBS)).astype(np.float32)
-    noise = np.random.default_rng(1).normal(size=(LANES, ACT)).astype(np.float32)
+    k_obs, k_noise = jax.random.split(jax.random.key(1))
+    obs, noise = jax.random.normal(k_obs, (LANES, OBS)), jax.random.normal(k_noise, (LANES, ACT))
     texts = np.concatenate([TOLD.text[:1], np.asarray(GOALS[:, 0])])
     posterior = learner.inference.posterior_of_belief(
         params.encoder_params, init_belief((TASKS + 1,), LATENT), texts, jnp.ones(TASKS + 1)
