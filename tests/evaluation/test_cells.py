@@ -156,6 +156,7 @@ def test_a_disk_that_refuses_a_row_is_two_lines():
 CHANGED: dict[str, Any] = {
     "goal_set": "fresh:3", "seed": 5, "horizon": 100, "physics": "mjx", "policy": "sampled",
     "z": "prior", "paraphrases": "heldout", "text_control": "zero", "text": "shut it",
+    "adapt": "search", "protocol": "task",
 }  # fmt: skip
 
 

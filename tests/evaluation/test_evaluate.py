@@ -270,9 +270,14 @@ def test_shuffled_donors_mix_tasks():
 
 def test_a_fault_while_adapting_counts_for_what_was_adapted(evaluator, policy, trial, monkeypatch):
     """A lane that was put back in an exploration episode is not clean at later k."""
-    played = list(evaluator.episodes([policy], trial, 3, seed=3))
-    faulty = [(b, e._replace(faults=e.faults + (i == 1))) for i, (b, e) in enumerate(played)]
-    monkeypatch.setattr(evaluator, "episodes", lambda *args: iter(faulty))
+    play, played = evaluator._play, []
+
+    def faulty(*args):
+        memories, score = play(*args)
+        played.append(score)
+        return memories, score._replace(faults=score.faults + (len(played) == 2))
+
+    monkeypatch.setattr(evaluator, "_play", faulty)
     scores = evaluator.run([policy], trial, (0, 1, 2), seed=3)
     assert [int(scores[k].faults.max()) for k in (0, 1, 2)] == [0, 1, 1]
     assert [int(scores[k].faults.min()) for k in (0, 1, 2)] == [0, 1, 1]

@@ -89,13 +89,15 @@ def test_the_belief_is_of_the_environments_transitions_but_the_last(session, pol
 
 def test_scores_are_the_environments(adapted):
     _, episodes, scores, _ = adapted
-    for steps, found in zip(episodes, scores, strict=True):
+    for steps, found in zip(episodes, scores.values(), strict=True):
         rewards = np.sum([reward for _, _, reward, _ in steps], 0)
         np.testing.assert_allclose(found.returns, rewards)
 
 
 class Player:
     """Recorded actions (step, 4) in the agent's place, over and over."""
+
+    explores = False
 
     def __init__(self, actions):
         self._actions = itertools.cycle(actions)
@@ -165,6 +167,30 @@ def test_noise_of_sampled_actions_is_the_lanes_episodes_and_steps_own(session, p
     assert not np.array_equal(alone[0], wanted[0])
     noise = agent._noise
     assert len(np.unique(noise)) == noise.size == LANES * HORIZON * 4
+
+
+def test_a_search_tries_its_arms_and_counts_apart(session, policy, trial):
+    """k = 0 is the native backend's; what counts is not learned from, and Meta-World's own
+    function explores as often as it is told."""
+    trial = replace(trial, draws=1)
+    evaluator = session.evaluator(8, adapt="search")
+    native = evaluator.run([policy.params], trial, (0,), seed=3)[0]
+    one = of_task(trial, 1)
+    found = k_shot(session, policy, one, (0, 2), HORIZON, seed=3, adapt="search")
+    np.testing.assert_allclose(found[0].returns, native.returns[0, 1:2], rtol=1e-4, atol=1e-5)
+    agent = agent_of(session, policy, one, [np.arange(LANES)], HORIZON, seed=3, adapt="search")
+    agent.init()
+    envs = make_vector_env(one.tasks[0], one.placements[0], LANES, HORIZON)
+    envs.call("toggle_terminate_on_success", False)
+    set_goals(envs, one.tasks[0], one.placements[0], False)
+    scores = adaptation_run(agent, envs, (0, 1, 3), HORIZON)
+    envs.close()
+    assert list(scores) == [0, 1, 3]
+    # Three explored, and each has been credited when the next episode began.
+    plays = np.asarray(agent.memory.plays)
+    assert (plays.sum(-1) == 3).all() and (plays[:, :3] == 1).all()
+    own = metaworlds_own(session, policy, one, EvalOptions(adapt="search"), HORIZON)
+    assert own["adaptation_episodes"] == 10
 
 
 def test_a_policy_that_is_told_the_task(trial):

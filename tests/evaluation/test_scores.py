@@ -21,7 +21,8 @@ COMMON = {
     "run": "runs/a", "checkpoint": 20, "policy_sha256": None,
     "config": "cmrl", "train_seed": 0, "env_steps": 9,
     "physics": "mjx", "horizon": 200, "goal_set": "heldout", "policy": "deterministic",
-    "z": "posterior", "donors": None, "paraphrases": "train", "text_control": "none", "text": None,
+    "z": "posterior", "adapt": "posterior", "protocol": "goal",
+    "donors": None, "paraphrases": "train", "text_control": "none", "text": None,
     "sentences": None, "eval_seed": 0,
 }  # fmt: skip
 
