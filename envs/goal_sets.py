@@ -57,16 +57,18 @@ def load_goal_set(
     """
     for task in tasks:
         task_id(task)
-    return np.stack([_goals_of(task, name, cache) for task in tasks])
-
-
-def _goals_of(task: str, name: str, cache: str | Path | None) -> np.ndarray:
-    if not REGISTRY[task].is_metaworlds:
-        return _from_reset_box(task, seed_of(name))
+    seed, packaged = seed_of(name), {}
     if name in SEEDS:
         packaged = _read(_PACKAGED, "python -m envs.goal_sets writes the packaged file again")
-        return _goals(packaged, f"{name}/{task}", _PACKAGED)
-    return _fresh(task, seed_of(name), _cache_directory(cache))
+    found = []
+    for task in tasks:
+        if not REGISTRY[task].is_metaworlds:
+            found.append(_from_reset_box(task, seed))
+        elif name in SEEDS:
+            found.append(_goals(packaged, f"{name}/{task}", _PACKAGED))
+        else:
+            found.append(_fresh(task, seed, _cache_directory(cache)))
+    return np.stack(found)
 
 
 def _from_reset_box(task: str, seed: int) -> np.ndarray:

@@ -31,15 +31,19 @@ def sources(
         told: what the lanes are told (policy, lane, ...).
         blank: the memories of lanes that have seen nothing.
     """
-    take = lambda memories, index: jax.tree.map(lambda x: x[:, index], memories)
     if z == "text":
         inexperienced = blank(told)
-        return lambda _, index: take(inexperienced, index)
+        return lambda _, index: take_lanes(inexperienced, index)
     if z == "prior":
         ignorant = blank(told._replace(text_mask=np.zeros_like(told.text_mask)))
-        return lambda _, index: take(ignorant, index)
+        return lambda _, index: take_lanes(ignorant, index)
     donor = donors(z, lanes.lane_id, lanes.env_task)
-    return lambda memories, index: take(memories, donor[index])
+    return lambda memories, index: take_lanes(memories, donor[index])
+
+
+def take_lanes(memories: Any, index: np.ndarray) -> Any:
+    """Memories (policy, lane, ...) of some lanes."""
+    return jax.tree.map(lambda x: x[:, index], memories)
 
 
 def donors(z: str, lane_id: np.ndarray, env_task: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 
 from cmrl_jax.algorithms.base import Agent
 from cmrl_jax.algorithms.common.rollout import (
-    StepStats,
     episode_figures,
     is_before_the_end,
     rollout,
@@ -115,25 +114,8 @@ def make_episode(env: MetaEnv, agent: Agent, horizon: int) -> EpisodeFn:
         ended = jnp.zeros(policies * per_policy, bool)
         (state, memory, _), scores = jax.lax.scan(run_chunk, (state, memory, ended), action_keys)
         reward, terminated, stats = jax.tree.map(lambda x: x.reshape(horizon, -1), scores)
-        result = scores_of(reward, stats, terminated if env.can_terminate else None, state.faults)
+        figures = episode_figures(reward, stats, terminated if env.can_terminate else None)
+        result = Episode(**figures._asdict(), faults=state.faults)
         return memory, jax.tree.map(by_policy, result)
 
     return episode
-
-
-def scores_of(
-    reward: jax.Array, stats: StepStats, terminated: jax.Array | None, faults: jax.Array
-) -> Episode:
-    """Scores of lanes (lane,) from an episode's steps (time, lane); see `episode_figures`."""
-    figures = episode_figures(reward, stats, terminated)
-    success = stats.success
-    if terminated is not None:
-        success = success & is_before_the_end(terminated)
-    return Episode(
-        success_any=figures.success_any,
-        success_last=figures.success_last,
-        returns=figures.returns,
-        first_success=jnp.where(figures.success_any, jnp.argmax(success, 0), len(reward)),
-        final_distance=figures.final_distance,
-        faults=faults,
-    )

@@ -21,7 +21,7 @@ import numpy as np
 
 from cmrl_jax.algorithms.base import Agent, Told
 from cmrl_jax.config.schema import Config
-from cmrl_jax.evaluation.controls import sources
+from cmrl_jax.evaluation.controls import sources, take_lanes
 from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
 from cmrl_jax.evaluation.options import MOST_DRAWS, ZSource
 from envs.base import MetaEnv
@@ -184,7 +184,7 @@ class Evaluator:
         is_apart = trial.adaptation is not None or self._agent.explores
         for episode in range(count):
             key = jax.random.fold_in(jax.random.key(seed), episode)
-            known, before = _lanes(memories, heirs), faults[:, heirs]
+            known, before = take_lanes(memories, heirs), faults[:, heirs]
             is_counted = counted is None or episode in counted
             if not is_apart:
                 memories, score = self._play(stage, known, source_of, lanes, False, key)
@@ -202,7 +202,7 @@ class Evaluator:
                 )
             if is_apart and episode + 1 < count:
                 places = self.lanes_of(learners, episode)
-                memories, learned = self._play(stage, memories, _lanes, places, False, key)
+                memories, learned = self._play(stage, memories, take_lanes, places, False, key)
                 faults = faults + learned.faults
 
     def _play(
@@ -223,7 +223,7 @@ class Evaluator:
             # Every batch acts on what was known before the episode, its donors' lanes too.
             memory, part = self._compiled(
                 stage.params,
-                _lanes(memories, index),
+                take_lanes(memories, index),
                 source_of(memories, index),
                 Lanes(*(x[index] for x in lanes)),
                 stage.deterministic,
@@ -288,11 +288,6 @@ def _heirs(trial: Trial) -> np.ndarray:
     """For each lane the one that learns for it (lane,): itself, or its task's of the same draw."""
     task, _, draw = _indices(trial)
     return np.arange(len(task)) if trial.adaptation is None else task * trial.draws + draw
-
-
-def _lanes(memories: Any, index: np.ndarray) -> Any:
-    """Memories (policy, lane, ...) of some lanes."""
-    return jax.tree.map(lambda x: x[:, index], memories)
 
 
 def _indices(trial: Trial) -> np.ndarray:

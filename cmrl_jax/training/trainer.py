@@ -267,13 +267,11 @@ class _Run:
         # As many as a whole task collects: what is learned from is no longer the task.
         if faults >= lanes_per_task(config) * config.env.horizon or (faults and is_strict):
             other = "native" if config.env.physics == "mjx" else "mjx"
-            cure = f"start a new run without the last change; {kept}"
-            if config.env.name == "ml4":
-                cure = cure.replace("without", f"with env.physics: {other}, or without")
+            simulator = f"with env.physics: {other}, or " if config.env.name == "ml4" else ""
             raise ConfigError(
                 f"iteration {iteration}: the physics of {faults} of "
                 f"{self.schedule.steps_per_iteration} control steps was non-finite",
-                cure,
+                f"start a new run {simulator}without the last change; {kept}",
             )
         if skipped:
             self.say(f"warning: {skipped:.1%} of the gradients were non-finite and were skipped")

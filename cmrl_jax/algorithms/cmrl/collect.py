@@ -19,7 +19,7 @@ from cmrl_jax import parallel
 from cmrl_jax.algorithms.base import RunState
 from cmrl_jax.algorithms.cmrl.diagnostics import make_diagnose
 from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
-from cmrl_jax.algorithms.cmrl.rules import lane_groups
+from cmrl_jax.algorithms.cmrl.rules import context_writers, lane_groups
 from cmrl_jax.algorithms.common import replay as rings
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.algorithms.common.rollout import (
@@ -34,12 +34,6 @@ from envs.base import MetaEnv
 
 LATE_STEPS = 50  # the last steps of an episode, whose mean reward shows the grip-and-wait optimum
 LANE_GROUPS = ("prior", "text", "posterior")
-
-
-def context_writers(config: Config) -> int:
-    """Lanes of a task whose episodes the context ring takes in."""
-    is_prior_alone = config.collect.context_lanes == "prior"
-    return lane_groups(config)[0] if is_prior_alone else lanes_per_task(config)
 
 
 def init_run(config: Config, env: MetaEnv, learner: Learner, key: jax.Array) -> RunState:

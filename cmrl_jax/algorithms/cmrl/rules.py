@@ -104,6 +104,12 @@ def lane_groups(config: Config) -> tuple[int, int, int]:
     return counts[0], counts[1], counts[2]
 
 
+def context_writers(config: Config) -> int:
+    """Lanes of a task whose episodes the context ring takes in."""
+    is_prior_alone = config.collect.context_lanes == "prior"
+    return lane_groups(config)[0] if is_prior_alone else lanes_per_task(config)
+
+
 def _check_model(config: Config) -> None:
     model, encoder = config.model, config.encoder
     cause = f"model.modules is {list(model.modules)}"
@@ -179,8 +185,7 @@ def _divisor(number: int, most: int) -> int:
 
 def _check_devices(config: Config, devices: int) -> None:
     tasks, per_task = len(config.tasks.train), lanes_per_task(config)
-    prior_only = config.collect.context_lanes == "prior"
-    episode = config.env.horizon * (lane_groups(config)[0] if prior_only else per_task)
+    episode = config.env.horizon * context_writers(config)
     sizes = (
         ("collect.lanes", config.collect.lanes, tasks, 1),
         ("train.capacity", config.train.capacity, per_task, 1),

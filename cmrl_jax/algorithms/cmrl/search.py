@@ -99,9 +99,14 @@ class SearchAgent:
     explores = True
 
     @property
+    def choices(self) -> int:
+        """Sentences of a lane: its task's own and those of the training tasks."""
+        return 1 + len(self.sentences)
+
+    @property
     def arms(self) -> int:
         """Their number; arm a is sentence a mod N of N, the task's own first, in mirror a div N."""
-        return (1 + len(self.sentences)) * len(self.symmetries[0])
+        return self.choices * len(self.symmetries[0])
 
     def init(self, told: Told) -> SearchMemory:
         lead, inference = told.task_row.shape, self._inference
@@ -139,7 +144,7 @@ class SearchAgent:
         memory, source = _credited(memory, self._no_score), _credited(source, self._no_score)
         order = self._order(source)
         tried = jnp.where(exploit, _best(source), self._next(source, order))
-        z = self._z_of(params, source, tried % (1 + len(self.sentences)))
+        z = self._z_of(params, source, tried % self.choices)
         learns = jnp.where(exploit, jnp.zeros_like(memory.learns), 1.0)
         return replace(memory, order=order, arm=tried, learns=learns, z=z)
 
@@ -152,7 +157,7 @@ class SearchAgent:
         deterministic: Any,
     ) -> jax.Array:
         of_obs, of_action = (jnp.asarray(signs) for signs in self.symmetries)
-        mirror = memory.arm // (1 + len(self.sentences))
+        mirror = memory.arm // self.choices
         action, _ = self.learner.policy(
             params.actor_params,
             params.obs_stats,

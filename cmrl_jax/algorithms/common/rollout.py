@@ -97,6 +97,7 @@ class EpisodeFigures(NamedTuple):
     success_any: jax.Array  # at any step
     success_last: jax.Array  # at its last step
     returns: jax.Array
+    first_success: jax.Array  # step, the number of steps where there is none
     final_distance: jax.Array  # at its last step
 
 
@@ -117,10 +118,12 @@ def episode_figures(
         reward, success = jnp.where(counts, reward, 0.0), success & counts
         end = jnp.sum(counts, 0, dtype=jnp.int32) - 1
         last = lambda x: jnp.take_along_axis(x, end[None], 0)[0]
+    success_any = jnp.any(success, 0)
     return EpisodeFigures(
-        success_any=jnp.any(success, 0),
+        success_any=success_any,
         success_last=last(success),
         returns=jnp.sum(reward, 0),
+        first_success=jnp.where(success_any, jnp.argmax(success, 0), len(reward)),
         final_distance=last(distance),
     )
 
