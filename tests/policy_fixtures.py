@@ -48,11 +48,13 @@ def random_policy(session: Session, seed: int):
     """PolicyParams with every weight drawn from a normal of std 0.5."""
     params = jax.eval_shape(session.algorithm.parts.init, jax.random.key(0))
     generator = np.random.default_rng(seed)
-    draw = lambda x: generator.normal(0, 0.5, x.shape).astype(x.dtype)
+    draw = lambda x: generator.normal(0, 0.5, x.shape).astype(np.float32)
+    inference, tasks = session.algorithm.parts.inference, session.algorithm.parts.num_tasks
     return PolicyParams(
         actor_params=jax.tree.map(draw, params.actor_params),
         encoder_params=jax.tree.map(draw, params.encoder_params),
         obs_stats=init_obs_stats(params.obs_stats.mean.size),
+        task_z=None if inference is None else draw(np.empty((tasks, inference.latent_dim))),
     )
 
 

@@ -206,6 +206,11 @@ class CollectConfig:
         "exploration noise of a task's lanes: from the policy's own to this many times it",
         low=1,
     )
+    scatter: int = doc(
+        0,
+        "steps of one random action that an episode begins with, at most; 0: none",
+        high=MOST_STEPS,
+    )
     initial: Literal["random", "prior"] = doc("random", "actions of iteration 0")
     context_source: Literal["recent", "all"] = doc("recent", "context from last episodes, or all")
     context_episodes: int = doc(2, "episodes a lane that the recent context ring holds", above=0)

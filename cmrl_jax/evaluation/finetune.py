@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmrl_jax.algorithms.base import Told
-from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, policy_params
+from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, make_policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
 from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
 from cmrl_jax.algorithms.common.replay import ReplayState, stored_transitions
@@ -242,6 +242,7 @@ class FineTuning:
         self.learner = RestrictedLearner(adapt, self.config, goals, *sizes, inference=inference)
         learner = self.learner
         self.agent = CmrlAgent(learner, self.config.collect.chunk)
+        self.policy_params = make_policy_params(learner)
         self.text, self.task = text, options.task
         iteration = TrainIteration(
             self.config,
@@ -285,7 +286,7 @@ class FineTuning:
             belief = jax.tree.map(lambda x: jnp.broadcast_to(x, (1, goals, *x.shape[1:])), own)
             memory = replace(memory, belief=belief)
         _, scores = self.episode(
-            jax.tree.map(lambda x: x[None], policy_params(self.run)),  # one policy
+            jax.tree.map(lambda x: x[None], self.policy_params(self.run)),  # one policy
             memory,
             memory,
             Lanes(row + task, np.arange(goals, dtype=np.int32), placements),

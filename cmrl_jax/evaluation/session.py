@@ -239,10 +239,11 @@ def load_policy(
         ConfigError: no such checkpoint, or it does not fit the session.
     """
     tasks = tuple(tasks or session.eval_tasks)
-    state = jax.eval_shape(session.algorithm.init, jax.random.key(0))
+    act = session.algorithm.policy_params
+    params = jax.eval_shape(lambda key: act(session.algorithm.init(key)), jax.random.key(0))
     shape = (len(tasks), session.goals.vectors.shape[-1])
     vectors = jax.ShapeDtypeStruct(shape, np.float32)
-    abstract = {"params": session.algorithm.policy_params(state), "goal_vectors": vectors}
+    abstract = {"params": params, "goal_vectors": vectors}
     with policy_store(run, read_only=True) as store:
         trees, meta = store.restore(
             {"policy": abstract}, step=checkpoint, versions=package_versions()

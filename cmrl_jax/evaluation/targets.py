@@ -65,8 +65,10 @@ def program_key(target: Target, adapt: str = "posterior") -> str:
     rules = rules_of(config)
     idle = (*IDLE, *rules.IDLE)
     acting = [(name, value) for name, _, value in leaves(config) if not _is_idle(name, idle)]
-    # A search's arms are the training tasks' sentences.
-    told = config.tasks.train if rules.is_told_the_task or adapt == "search" else ()
+    if rules.is_told_the_task:
+        told = config.tasks.train
+    else:  # a search has arms for each training task
+        told = len(config.tasks.train) if adapt == "search" else 0
     return repr((acting, told, target.k))
 
 

@@ -114,9 +114,9 @@ def trial_of(
     Raises:
         ConfigError: a sentence that cannot be had, or a goal set that cannot be read.
     """
-    if options.adapt == "search":  # whose arms are the sentences that lie here now
-        for policy in policies:
-            _table(policy, session.config, options, session.config.tasks.train)
+    if options.adapt == "search" and any(map(_is_incomplete, policies)):
+        cause = "--adapt search with a policy that was saved before there was a search"
+        raise ConfigError(cause, "resume its run, whose next policy has what is searched")
     texts = [task_sentences(policy, session.config, options, tasks) for policy in policies]
     return Trial(
         tasks=tasks,
@@ -127,6 +127,11 @@ def trial_of(
         z=options.z,
         deterministic=options.policy == "deterministic",
     )
+
+
+def _is_incomplete(policy: Policy) -> bool:
+    """Whether an older version saved it, without all that is saved today (NaN)."""
+    return any(np.isnan(np.asarray(leaf)).any() for leaf in jax.tree.leaves(policy.params))
 
 
 def adaptation_goals(

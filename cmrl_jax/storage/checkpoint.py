@@ -24,7 +24,7 @@ from cmrl_jax.config.files import check_origin, check_resumable
 from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.storage.manifest import find_damage, fingerprint, is_listed, write_manifest
 from cmrl_jax.storage.named_arrays import describe, flatten, not_finite, placed, unflatten
-from cmrl_jax.storage.old_statistics import as_stored, brought_up
+from cmrl_jax.storage.older_forms import as_stored, brought_up
 from cmrl_jax.streams import to_stderr
 
 FULL_ITEMS = ("learner", "replay", "context")
@@ -175,14 +175,14 @@ class CheckpointStore:
             check_resumable(meta["config"], config, self.directory.parent)
         if versions is not None:
             _warn_of_versions(self.directory / str(step), meta["versions"], versions)
-        wanted = self._stored_arrays(step, {name: flatten(abstract[name]) for name in self.items})
+        wanted = {name: flatten(abstract[name]) for name in self.items}
         args = {
             name: ocp.args.StandardRestore({path: placed(leaf) for path, leaf in leaves.items()})
-            for name, leaves in wanted.items()
+            for name, leaves in self._stored_arrays(step, wanted).items()
             if leaves
         }
         found = self._read(step, args) if args else {}
-        leaves = {name: brought_up(found.get(name) or {}) for name in self.items}
+        leaves = {name: brought_up(found.get(name) or {}, wanted[name]) for name in self.items}
         return {name: unflatten(abstract[name], leaves[name]) for name in self.items}, meta
 
     def resume(

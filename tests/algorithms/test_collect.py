@@ -1,11 +1,11 @@
-"""Exploration: how much wider than the policy's own the noise of a lane is."""
+"""Exploration: how much wider than the policy's own a lane's noise is; actions that are imposed."""
 
 from dataclasses import replace
 
 import jax
 import numpy as np
 
-from cmrl_jax.algorithms.cmrl.collect import make_noise_scale
+from cmrl_jax.algorithms.cmrl.collect import imposed_actions, make_noise_scale
 from cmrl_jax.config.schema import Config
 
 
@@ -31,3 +31,26 @@ def test_a_single_lane_of_a_task_covers_it_over_episodes():
         expected = 6.0**quantile
         np.testing.assert_allclose(np.quantile(drawn, quantile, axis=0), expected, rtol=0.1)
     assert np.abs(np.corrcoef(np.log(drawn).T) - np.eye(3)).max() < 0.1
+
+
+def imposed(scatter, is_first):
+    config = config_of(96)
+    config = replace(config, collect=replace(config.collect, scatter=scatter))
+    return map(np.asarray, imposed_actions(config, 4, jax.random.key(0), np.bool_(is_first)))
+
+
+def test_an_episode_begins_with_up_to_so_many_steps_of_one_random_action():
+    push, where = imposed(8, is_first=False)
+    lengths = where.sum(0)
+    assert lengths.min() == 0 and lengths.max() == 8  # of 96 lanes
+    np.testing.assert_array_equal(where, np.arange(len(where))[:, None] < lengths)
+    np.testing.assert_array_equal(push, np.broadcast_to(push[:1], push.shape))
+    assert np.abs(np.corrcoef(push[0].T) - np.eye(4)).max() < 0.4
+    assert push.min() < -0.95 and push.max() > 0.95
+
+
+def test_only_iteration_0_is_uniform_throughout():
+    actions, where = imposed(0, is_first=True)
+    assert where.all() and len(np.unique(actions)) > 0.99 * actions.size
+    _, later = imposed(0, is_first=False)
+    assert not later.any()

@@ -10,6 +10,7 @@ from learner_fixtures import ACT, GOALS, LATENT, OBS, TASKS, build, tiny_config
 
 from cmrl_jax.algorithms.base import Told
 from cmrl_jax.algorithms.cmrl.agent import PolicyParams
+from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.cmrl.search import BUDGET, Rule, SearchAgent, round_starts
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.nn.context import init_belief
@@ -32,11 +33,12 @@ def made():
 @pytest.fixture(scope="module")
 def params(made):
     state = made.state
-    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
+    task_z = jax.random.normal(jax.random.key(5), (TASKS, LATENT))
+    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats, task_z)
 
 
-def agent_of(made, rule: Rule = "peak"):
-    return SearchAgent(made.learner, STEPS, GOALS[:, 0], MIRRORS, rule)
+def agent_of(made, rule: Rule = "return"):
+    return SearchAgent(made.learner, STEPS, MIRRORS, rule)
 
 
 def transitions(reward):
@@ -49,7 +51,7 @@ def transitions(reward):
 class Trial:
     """Episodes one after the other, whose rewards are a function of the arm."""
 
-    def __init__(self, made, params, value, rule: Rule = "peak"):
+    def __init__(self, made, params, value, rule: Rule = "return"):
         self.agent, self.params, self.value = agent_of(made, rule), params, value
         self.memory = self.agent.init(TOLD)
         self.begin = jax.jit(self.agent.begin_episode)
@@ -106,7 +108,10 @@ def test_few_arms_are_searched_to_the_end(made, params, tasks):
     """Without mirrors there are 2 to 4: every exploring episode is credited to one of them."""
     identity = np.ones((1, OBS), np.float32), np.ones((1, ACT), np.float32)
     trial = Trial(made, params, lambda lane, arm: np.full(STEPS, float(arm == tasks)))
-    trial.agent = SearchAgent(made.learner, STEPS, GOALS[:tasks, 0], identity)
+    config = tiny_config()
+    config = replace(config, tasks=replace(config.tasks, train=config.tasks.train[:tasks]))
+    few = Learner(config, GOALS[:tasks], OBS, ACT)
+    trial.agent = SearchAgent(few, STEPS, identity)
     trial.memory = trial.agent.init(TOLD)
     trial.begin = jax.jit(trial.agent.begin_episode)
     for _ in range(BUDGET + 3):
@@ -128,17 +133,17 @@ def test_an_episode_that_counts_takes_the_best_arm_and_teaches_nothing(made, par
 
 
 def test_the_rule_decides_what_is_best(made, params):
-    """Arm 1 holds 5 for the whole episode; arm 6 reaches 9 in half of it, and nothing else."""
+    """Arm 1 holds 4.6 for the whole episode; arm 6 reaches 9 in half of it, and earns less."""
 
     def value(lane, arm):
         reward = np.zeros(STEPS)
         if arm == 1:
-            reward[:] = 5.0
+            reward[:] = 4.6
         if arm == 6:
             reward[STEPS // 2 :] = 9.0
         return reward
 
-    by_rule: dict[Rule, int] = {"return": 1, "peak": 6}
+    by_rule: dict[Rule, int] = {"return": 1, "late": 6}
     for rule, best in by_rule.items():
         trial = Trial(made, params, value, rule)
         for _ in range(ARMS):
@@ -155,40 +160,43 @@ def test_a_step_that_is_masked_earns_nothing(made, params):
     np.testing.assert_array_equal(after.score, [STEPS, 3, STEPS])
 
 
-def test_a_window_with_a_masked_step_is_no_peak(made, params):
-    """Rewards of -3, then -1; of the second window one step is masked in lane 1, all in lane 2."""
-    agent = agent_of(made)
-    memory = agent.init(TOLD)
-    reward = np.full((LANES, STEPS + 2), -3.0, np.float32)
-    reward[:, 5:10] = -1.0
+def test_late_rewards_are_averaged_the_last_ones_most(made, params):
+    agent, rate = agent_of(made, "late"), 1 / 50
+    reward = np.random.default_rng(0).normal(size=(LANES, STEPS)).astype(np.float32)
     mask = np.ones_like(reward)
-    mask[1, 7], mask[2] = 0, 0
-    after = agent.observe(params, memory, transitions(reward), jnp.asarray(mask))
-    np.testing.assert_array_equal(after.score, [-1, -3, -np.inf])
+    mask[1, 3:], mask[2] = 0, 0
+    memory = agent.init(TOLD)
+    for _ in range(2):
+        memory = agent.observe(params, memory, transitions(reward), jnp.asarray(mask))
+    for lane, length in enumerate((STEPS, 3, 0)):
+        average = 0.0
+        for x in np.tile(reward[lane, :length], 2):
+            average += rate * (x - average)
+        np.testing.assert_allclose(memory.score[lane], average, rtol=1e-5)
 
 
-def test_an_arm_is_a_sentences_z_in_a_mirror(made, params):
-    """Action of arm (sentence, mirror) = mirrored action of the policy, told z, on mirrored obs."""
+def test_an_arm_is_a_tasks_z_in_a_mirror(made, params):
+    """Action of arm (z, mirror) = mirrored action of the policy, told z, on mirrored obs."""
     agent, learner = agent_of(made), made.learner
     k_obs, k_noise = jax.random.split(jax.random.key(1))
     obs, noise = jax.random.normal(k_obs, (LANES, OBS)), jax.random.normal(k_noise, (LANES, ACT))
-    texts = np.concatenate([TOLD.text[:1], np.asarray(GOALS[:, 0])])
-    posterior = learner.inference.posterior_of_belief(
-        params.encoder_params, init_belief((TASKS + 1,), LATENT), texts, jnp.ones(TASKS + 1)
+    own = learner.inference.posterior_of_belief(
+        params.encoder_params, init_belief((1,), LATENT), TOLD.text[:1], jnp.ones(1)
     )
+    z_of = np.concatenate([own.mean, params.task_z])
     keys = jax.random.split(jax.random.key(0), LANES)
     trial = Trial(made, params, constant)
-    for _ in range(ARMS):
+    for tried in range(ARMS):
         begun = trial.begin(params, trial.memory, trial.memory, keys, np.bool_(False))
-        [arm] = set(begun.arm.tolist())
-        sentence, mirror = arm % (TASKS + 1), arm // (TASKS + 1)
-        z = np.broadcast_to(posterior.mean[sentence], (LANES, LATENT))
+        assert (begun.arm == tried).all()
+        z = np.broadcast_to(z_of[tried // 2], (LANES, LATENT))
         np.testing.assert_allclose(begun.z, z, rtol=1e-5)
+        of_obs, of_action = (signs[tried % 2] for signs in MIRRORS)
         wanted, _ = learner.policy(
-            params.actor_params, params.obs_stats, obs * MIRRORS[0][mirror], z, None, False, noise
+            params.actor_params, params.obs_stats, obs * of_obs, z, None, False, noise
         )
         got = agent.act(params, begun, obs, noise, False)
-        np.testing.assert_allclose(got, wanted * MIRRORS[1][mirror], rtol=1e-5)
+        np.testing.assert_allclose(got, wanted * of_action, rtol=1e-5)
         trial.play()
 
 

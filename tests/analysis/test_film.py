@@ -38,8 +38,10 @@ def session():
 
 @pytest.fixture(scope="module")
 def params(session):
-    state = jit_once(session.algorithm.parts.init)(jax.random.key(3))
-    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
+    learner = session.algorithm.parts
+    state = jit_once(learner.init)(jax.random.key(3))
+    task_z = np.zeros((learner.num_tasks, learner.inference.latent_dim), np.float32)
+    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats, task_z)
 
 
 def test_filmed_states_are_metaworlds():

@@ -158,9 +158,9 @@ def test_every_flag_changes_its_option(calls, here):
 
 
 def test_a_search_needs_arms(calls, refused, here):
-    make_run(here / "p", "pearl.yaml")
-    cause, cure = refused("eval", "--run", "p", "--adapt", "search")
-    assert cause == "--adapt search with encoder.goal_fusion none (p)"
+    make_run(here / "p", "mtsac.yaml")
+    cause, cure = refused("eval", "--run", "p", "--adapt", "search", "--k", "0")
+    assert cause == "--adapt search with model.conditioning task_id (p)"
     assert cure == "leave it out, or use one of: posterior"
 
 

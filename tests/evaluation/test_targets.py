@@ -151,8 +151,8 @@ def test_a_program_is_named_by_all_that_is_not_known_to_be_idle(twins):
     assert not idle_keys(told, ["tasks.train"])
 
 
-def test_folds_are_searched_each_by_its_own_program():
-    """A search's arms are the training tasks' sentences, which two folds have not in common."""
+def test_a_search_of_fewer_tasks_has_its_own_program():
+    """A search has arms for each training task, so its program is another with fewer of them."""
     config = small_config()
     other = replace(config, tasks=replace(config.tasks, train=config.tasks.train[:2], test=()))
     keys = lambda adapt: [

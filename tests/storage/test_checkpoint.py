@@ -238,6 +238,19 @@ def test_old_statistics_of_another_size_are_refused(tmp_path):
             store.restore({"policy": abstract})
 
 
+def test_what_an_older_policy_lacks_is_nan(tmp_path):
+    """But only what a version has added: anything else that is absent is refused."""
+    with checkpoint.policy_store(tmp_path) as store:
+        store.save({"policy": {"params": {"actor_params": jnp.ones(2)}}}, make_meta(1))
+        shapes = {"actor_params": jnp.ones(2), "task_z": jnp.ones((3, 2))}
+        found, _ = store.restore({"policy": {"params": shapes}})
+        params = found["policy"]["params"]
+        assert np.isnan(params["task_z"]).all() and params["task_z"].shape == (3, 2)
+        assert_equal_trees(params["actor_params"], jnp.ones(2))
+        with pytest.raises(ConfigError, match=r"more is absent there, float32\[2\] here"):
+            store.restore({"policy": {"params": shapes | {"more": jnp.ones(2)}}})
+
+
 def test_other_package_versions_warn_in_one_line(tmp_path, capsys):
     save_steps(tmp_path, 1)
     restore(tmp_path, versions=VERSIONS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -10,23 +11,54 @@ import jax.numpy as jnp
 from flax import struct
 
 from cmrl_jax.algorithms.base import RunState, Told
-from cmrl_jax.algorithms.cmrl.learner import Learner
-from cmrl_jax.algorithms.common.replay import Transition
+from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
+from cmrl_jax.algorithms.common.replay import ReplayState, Transition, sample_transitions
 from cmrl_jax.nn.context import Belief, init_belief
+
+CONTEXTS = 16  # of a training task, over which its z is averaged
 
 
 class PolicyParams(NamedTuple):
-    """What acting needs: the policy checkpoint's arrays."""
+    """What acting needs: the policy checkpoint's arrays.
+
+    Attributes:
+        encoder_params: None without a latent.
+        task_z: (training task, latent), the mean of q(z | context, text) over recent contexts of
+            each; what a search tries. None without a latent.
+    """
 
     actor_params: Any
-    encoder_params: Any  # None without a latent
+    encoder_params: Any
     obs_stats: Any
+    task_z: Any
 
 
-def policy_params(run: RunState) -> PolicyParams:
-    """The part of a run's state that acts."""
-    state = run.learner
-    return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats)
+def make_policy_params(learner: Learner) -> Callable[[RunState], PolicyParams]:
+    """RunState -> the part of it that acts."""
+    inference = learner.inference
+    tasks, n = learner.num_tasks, learner.config.encoder.context_max
+
+    @jax.jit
+    def mean_z(state: TrainState, ring: ReplayState) -> jax.Array:
+        assert inference is not None
+        row = jnp.repeat(jnp.arange(tasks), CONTEXTS)
+        # The same draw each time: the state alone decides.
+        context = sample_transitions(ring, jax.random.key(0), row, n)
+        posterior = inference.posterior(
+            state.encoder_params,
+            learner.normalized(state.obs_stats, context),
+            jnp.broadcast_to(ring.size > 0, (len(row), n)),
+            learner.goal_vectors[row, 0],
+            jnp.ones(len(row)),
+        )
+        return jnp.mean(posterior.mean.reshape(tasks, CONTEXTS, -1), 1)
+
+    def policy_params(run: RunState) -> PolicyParams:
+        state = run.learner
+        task_z = None if inference is None else mean_z(state, run.context)
+        return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats, task_z)
+
+    return policy_params
 
 
 @struct.dataclass

@@ -8,7 +8,7 @@ from __future__ import annotations
 import jax
 
 from cmrl_jax.algorithms.base import Agent, Algorithm, RunState
-from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, policy_params
+from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, make_policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
 from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.cmrl.search import SearchAgent
@@ -31,14 +31,13 @@ def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
         return run.learner.gradient_steps
 
     agents: dict[str, Agent] = {"posterior": CmrlAgent(learner, config.collect.chunk)}
-    if learner.inference is not None and learner.inference.has_goal_factor:
-        sentences = goal_vectors[:, 0]
-        agents["search"] = SearchAgent(learner, config.collect.chunk, sentences, env.symmetries)
+    if learner.inference is not None:
+        agents["search"] = SearchAgent(learner, config.collect.chunk, env.symmetries)
     return Algorithm(
         agents=agents,
         init=lambda key: init_run(config, env, learner, key),
         make_iteration=make_iteration,
-        policy_params=policy_params,
+        policy_params=make_policy_params(learner),
         gradient_steps=gradient_steps,
         parts=learner,
     )

@@ -95,16 +95,18 @@ class TrainIteration:
         config, env = self.config, self.env
         collect, horizon = config.collect, config.env.horizon
         is_first = run.iteration == 0
-        k_z, k_reset, k_noise, k_chunks, k_diagnose, key = jax.random.split(run.key, 6)
+        k_z, k_reset, k_noise, k_imposed, k_chunks, k_diagnose, key = jax.random.split(run.key, 7)
         zc, actual_source = self.draw_conditioning(run, k_z)
         shape = (self.lanes, env.action_size)
         noise = self.noise_scale(k_noise)[:, None] * correlated_noise(
             k_noise, horizon, shape, collect.noise_correlation
         )
 
-        def chunk(carry: tuple[RunState, Any], inputs: tuple[jax.Array, jax.Array, jax.Array]):
+        imposed = imposed_actions(config, env.action_size, k_imposed, is_first)
+
+        def chunk(carry: tuple[RunState, Any], inputs: Any):
             run, state = carry
-            index, key, chunk_noise = inputs
+            index, key, chunk_noise, chunk_imposed = inputs
             k_act, k_update = jax.random.split(key)
             actor_params, obs_stats = run.learner.actor_params, run.learner.obs_stats
 
@@ -119,7 +121,7 @@ class TrainIteration:
                 collect.chunk,
                 horizon,
                 begun=index * collect.chunk,
-                random_actions=is_first & (collect.initial == "random"),
+                imposed=chunk_imposed,
                 noise=chunk_noise,
                 restart=self.reset_lanes,
             )
@@ -134,11 +136,14 @@ class TrainIteration:
 
         run = run.replace(key=key)
         chunks = horizon // collect.chunk
+        in_chunks = lambda tree: jax.tree.map(
+            lambda x: x.reshape(chunks, collect.chunk, *x.shape[1:]), tree
+        )
         keys = jax.random.split(k_chunks, chunks)
         (run, _), (metrics, reward, terminated, stats) = jax.lax.scan(
             chunk,
             (run, self.reset_lanes(k_reset)),
-            (jnp.arange(chunks), keys, noise.reshape(chunks, collect.chunk, *shape)),
+            (jnp.arange(chunks), keys, *map(in_chunks, (noise, imposed))),
         )
         metrics = {name: jnp.mean(value, 0) for name, value in metrics.items()}
         flat = lambda x: self.by_task(x.reshape(horizon, self.lanes))  # (time, task, lane)
@@ -263,3 +268,23 @@ def make_noise_scale(config: Config) -> Callable[[jax.Array], jax.Array]:
     scale = np.geomspace(1.0, widest, per_task)[shuffled]
     fixed = jnp.asarray(np.tile(scale, lanes // per_task), jnp.float32)
     return lambda key: fixed
+
+
+def imposed_actions(
+    config: Config, action_size: int, key: jax.Array, is_first: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Actions (time, lane, act) in place of the policy's in an iteration, and where (time, lane).
+
+    Iteration 0 may be uniform noise throughout. In any other an episode begins with up to
+    `collect.scatter` steps of one random action, so that the policy learns to go on from wherever
+    they lead to.
+    """
+    collect, horizon = config.collect, config.env.horizon
+    k_uniform, k_push, k_length = jax.random.split(key, 3)
+    draw = lambda key, *lead: jax.random.uniform(
+        key, (*lead, collect.lanes, action_size), minval=-1.0, maxval=1.0
+    )
+    length = jax.random.randint(k_length, (collect.lanes,), 0, collect.scatter + 1)
+    scattered = jnp.arange(horizon)[:, None] < length
+    is_random = is_first & (collect.initial == "random")
+    return jnp.where(is_random, draw(k_uniform, horizon), draw(k_push)), scattered | is_random

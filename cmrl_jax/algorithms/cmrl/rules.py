@@ -22,6 +22,7 @@ class Rules(AlgorithmRules):
         "collect.group_frac",
         "collect.noise_correlation",
         "collect.noise_scale",
+        "collect.scatter",
         "collect.initial",
         "collect.context_source",
         "collect.context_episodes",
@@ -51,7 +52,7 @@ class Rules(AlgorithmRules):
         self.adapts = conditioning == "z"
         self.reads_text = self.adapts and fusion != "none"
         self.can_start_from_text = self.adapts and fusion in ("factor", "both")
-        self.ways = ("posterior", "search") if self.can_start_from_text else ("posterior",)
+        self.ways = ("posterior", "search") if self.adapts else ("posterior",)
         self.is_told_the_task = conditioning == "task_id"
         self.kind = f"model.conditioning {conditioning}"
         if self.adapts:
@@ -161,6 +162,8 @@ def _check_sizes(config: Config) -> None:
     cause = f"env.horizon {horizon} is not a multiple of collect.chunk {collect.chunk}"
     cure = f"set collect.chunk: {_divisor(horizon, collect.chunk)}"
     require(horizon % collect.chunk == 0, cause, cure)
+    cause = f"collect.scatter {collect.scatter} leaves nothing of env.horizon {horizon}"
+    require(collect.scatter < horizon, cause, f"set collect.scatter below {horizon}")
     cause = f"sac.n_step {config.sac.n_step} is longer than env.horizon {horizon}"
     require(config.sac.n_step <= horizon, cause, f"set sac.n_step to at most {horizon}")
     capacity = config.train.capacity

@@ -1,15 +1,15 @@
 """Adaptation by search: which z, and which reflection of the scene, earns most on the task at hand.
 
 An arm is a z and a symmetry of the environment (`MetaEnv.symmetries`): the z of the task's own
-sentence and of every training task's, each seen in every mirror. Exploring episodes try arms by
-successive halving (Karnin et al. 2013: sequential halving): all of them once, then fewer and fewer
-of the best. A counted episode takes the best arm so far and teaches nothing. Arms are judged by
-rewards alone. Everything is data in the compiled episode, so one program plays any budget.
+sentence (the prior's mean without text) and that of every training task, each seen in every mirror.
+Exploring episodes try arms by successive halving (Karnin et al. 2013: sequential halving): all of
+them once, then fewer and fewer of the best. A counted episode takes the best arm so far and teaches
+nothing. Arms are judged by rewards alone. Everything is data in the compiled episode, so one
+program plays any budget.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -25,9 +25,9 @@ from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.nn.context import init_belief
 
 BUDGET = 20  # exploring episodes that the rounds are laid out for
-PEAK_STEPS = 5  # consecutive steps whose mean reward is an episode's peak
+LATE_STEPS = 50.0  # over which late rewards are averaged, the last ones most
 
-Rule = Literal["return", "peak"]
+Rule = Literal["return", "late"]
 
 
 @struct.dataclass
@@ -82,31 +82,28 @@ class SearchAgent:
     Args:
         learner: with a latent.
         chunk: control steps between two calls of `observe`.
-        sentences: text vectors of the training tasks (task, G).
         symmetries: signs of observations (symmetry, obs) and of actions (symmetry, act), the
             identity first.
-        rule: what an episode is scored by: its return, or the largest mean reward of a window of
-            `PEAK_STEPS` steps; windows lie end to end from each observed stretch's first step.
+        rule: what an episode is scored by: its return, or its late rewards, an exponential average
+            over about `LATE_STEPS` steps that starts at 0 and is read where the episode ends.
     """
 
     learner: Learner
     chunk: int
-    sentences: jax.Array
     symmetries: tuple[np.ndarray, np.ndarray]
-    rule: Rule = "peak"
+    rule: Rule = "return"
 
     adapts = True
     explores = True
 
     @property
-    def choices(self) -> int:
-        """Sentences of a lane: its task's own and those of the training tasks."""
-        return 1 + len(self.sentences)
+    def mirrors(self) -> int:
+        return len(self.symmetries[0])
 
     @property
     def arms(self) -> int:
-        """Their number; arm a is sentence a mod N of N, the task's own first, in mirror a div N."""
-        return self.choices * len(self.symmetries[0])
+        """Their number; arm a is z a div N, the task's own first, in mirror a mod N of N."""
+        return (1 + self.learner.num_tasks) * self.mirrors
 
     def init(self, told: Told) -> SearchMemory:
         lead, inference = told.task_row.shape, self._inference
@@ -119,13 +116,9 @@ class SearchAgent:
             order=jnp.broadcast_to(jnp.arange(self.arms), by_arm.shape),
             arm=jnp.zeros(lead, jnp.int32),
             learns=jnp.zeros(lead),
-            score=jnp.full(lead, self._no_score),
+            score=jnp.zeros(lead),
             z=jnp.zeros((*lead, inference.latent_dim)),
         )
-
-    @property
-    def _no_score(self) -> float:
-        return 0.0 if self.rule == "return" else -jnp.inf
 
     @property
     def _inference(self) -> Any:
@@ -141,10 +134,10 @@ class SearchAgent:
         exploit: jax.Array,
     ) -> SearchMemory:
         del keys  # nothing is drawn
-        memory, source = _credited(memory, self._no_score), _credited(source, self._no_score)
+        memory, source = _credited(memory), _credited(source)
         order = self._order(source)
         tried = jnp.where(exploit, _best(source), self._next(source, order))
-        z = self._z_of(params, source, tried % self.choices)
+        z = self._z_of(params, source, tried // self.mirrors)
         learns = jnp.where(exploit, jnp.zeros_like(memory.learns), 1.0)
         return replace(memory, order=order, arm=tried, learns=learns, z=z)
 
@@ -157,7 +150,7 @@ class SearchAgent:
         deterministic: Any,
     ) -> jax.Array:
         of_obs, of_action = (jnp.asarray(signs) for signs in self.symmetries)
-        mirror = memory.arm // self.choices
+        mirror = memory.arm % self.mirrors
         action, _ = self.learner.policy(
             params.actor_params,
             params.obs_stats,
@@ -172,15 +165,12 @@ class SearchAgent:
     def observe(
         self, params: PolicyParams, memory: SearchMemory, transitions: Transition, mask: jax.Array
     ) -> SearchMemory:
-        reward, counts = transitions.reward, mask > 0
-        if self.rule == "return":
-            return replace(memory, score=memory.score + jnp.sum(reward, -1, where=counts))
-        steps = min(PEAK_STEPS, self.chunk)
-        short = -reward.shape[1] % steps  # steps that the last window lacks, and that spoil it
-        window = lambda x: jnp.pad(x, ((0, 0), (0, short))).reshape(len(x), -1, steps)
-        whole = jnp.all(window(counts), -1)
-        peak = jnp.max(jnp.where(whole, jnp.mean(window(reward), -1), -jnp.inf), -1)
-        return replace(memory, score=jnp.maximum(memory.score, peak))
+        rate = 0.0 if self.rule == "return" else 1.0 / LATE_STEPS
+        steps = jnp.cumsum(mask[:, ::-1], -1)[:, ::-1]  # that count, from each one on
+        before = memory.score * (1.0 - rate) ** steps[:, 0]
+        kept = jnp.where(mask > 0, (1.0 - rate) ** (steps - 1.0), 0.0)
+        earned = jnp.sum(transitions.reward * kept, -1)
+        return replace(memory, score=before + (earned if rate == 0 else rate * earned))
 
     def _order(self, memory: SearchMemory) -> jax.Array:
         """The order of the round at hand: anew from what is known where a round begins."""
@@ -198,19 +188,17 @@ class SearchAgent:
         place = jnp.where(done >= starts[-1], 0, done - begun).astype(jnp.int32)
         return jnp.take_along_axis(order, place[..., None], -1)[..., 0]
 
-    def _z_of(self, params: PolicyParams, memory: SearchMemory, sentence: jax.Array) -> jax.Array:
-        """Mean of the belief over a sentence alone, 0 for the lane's own (lane, latent)."""
-        posterior: Callable[..., Any] = self._inference.posterior_of_belief
-        count, latent = len(self.sentences), self._inference.latent_dim
-        trained = posterior(
-            params.encoder_params, init_belief((count,), latent), self.sentences, jnp.ones(count)
+    def _z_of(self, params: PolicyParams, memory: SearchMemory, which: jax.Array) -> jax.Array:
+        """The lane's own z where `which` (lane,) is 0, else the training task's before it."""
+        inference = self._inference
+        nothing = init_belief(which.shape, inference.latent_dim)
+        own = inference.posterior_of_belief(
+            params.encoder_params, nothing, memory.text, memory.text_mask
         ).mean
-        nothing = init_belief(sentence.shape, latent)
-        own = posterior(params.encoder_params, nothing, memory.text, memory.text_mask).mean
-        return jnp.where((sentence == 0)[..., None], own, trained[sentence - 1])
+        return jnp.where((which == 0)[..., None], own, params.task_z[which - 1])
 
 
-def _credited(memory: SearchMemory, no_score: float) -> SearchMemory:
+def _credited(memory: SearchMemory) -> SearchMemory:
     """The memory with the episode that has ended credited to its arm, if it was to be."""
     played = jax.nn.one_hot(memory.arm, memory.plays.shape[-1]) * memory.learns[..., None]
     score = jnp.where(played > 0, memory.score[..., None], 0.0)
@@ -219,7 +207,7 @@ def _credited(memory: SearchMemory, no_score: float) -> SearchMemory:
         plays=memory.plays + played,
         credit=memory.credit + score,
         learns=jnp.zeros_like(memory.learns),
-        score=jnp.full_like(memory.score, no_score),
+        score=jnp.zeros_like(memory.score),
     )
 
 

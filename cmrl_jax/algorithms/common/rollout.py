@@ -37,7 +37,7 @@ def rollout(
     steps: int,
     horizon: int,
     begun: jax.Array | int = 0,
-    random_actions: jax.Array | bool = False,
+    imposed: tuple[jax.Array, jax.Array] | None = None,
     noise: jax.Array | None = None,
     restart: Callable[[jax.Array], Any] | None = None,
 ) -> tuple[Any, Transition, StepStats]:
@@ -47,7 +47,7 @@ def rollout(
         state: environment states, leading axis lane.
         horizon: control steps after which whatever episode a lane is in is cut.
         begun: how many of those have passed.
-        random_actions: () bool; uniform actions in place of the policy's.
+        imposed: actions (steps, lane, act) in place of the policy's, and where (steps, lane) bool.
         noise: (steps, lane, act) standard normal, for `act`.
         restart: key -> fresh states of all lanes, which those take whose episode has ended in a
             terminal; None leaves them where they are, and their later steps mean nothing.
@@ -57,13 +57,12 @@ def rollout(
     """
     lanes = state.obs.shape[0]
 
-    def step(state: Any, inputs: tuple[jax.Array, jax.Array, jax.Array | None]):
-        time, key, step_noise = inputs
-        k_act, k_uniform = jax.random.split(key)
-        k_restart = jax.random.fold_in(key, 2)  # beside the two above
+    def step(state: Any, inputs: Any):
+        time, key, step_noise, in_place = inputs
+        k_act, k_restart = jax.random.split(key)
         action = act(state.obs, k_act, step_noise)
-        uniform = jax.random.uniform(k_uniform, action.shape, minval=-1.0, maxval=1.0)
-        action = jnp.where(random_actions, uniform, action)
+        if in_place is not None:
+            action = jnp.where(in_place[1][:, None], in_place[0], action)
         new = parallel.by_part(jax.vmap(env.step))(state, action)
         terminated = new.terminated if env.can_terminate else jnp.zeros((lanes,), bool)
         transition = Transition(
@@ -80,7 +79,7 @@ def rollout(
             new = select_lanes(terminated, restart(k_restart), new)
         return new, (transition, stats)
 
-    inputs = (begun + jnp.arange(steps), jax.random.split(key, steps), noise)
+    inputs = (begun + jnp.arange(steps), jax.random.split(key, steps), noise, imposed)
     state, (transitions, stats) = jax.lax.scan(step, state, inputs)
     return state, transitions, stats
 

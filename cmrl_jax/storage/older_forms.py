@@ -1,7 +1,8 @@
-"""Running statistics of checkpoints from before `moments.py`: read as they were, then brought up.
+"""Checkpoints of older versions: arrays are read in the form they had, then brought up.
 
-Those held sums of squared deviations, and of returns a count in float32. A run goes on from them
-with the means and the counts that they stand for.
+Running statistics from before `moments.py` were sums of squared deviations, and of returns a count
+in float32; a run goes on from them with the means and the counts that they stand for. What was not
+saved yet is NaN.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ _OLD = {
     "obs_stats/summed_variance": ("mean", "summed_variance", "std_eps", "count/hi", "count/lo"),
     "return_stats/m2": ("mean", "m2", "count"),
 }
+_ADDED = ("params/task_z",)  # of policies, since there is a search over them
 _NEW = (
     "moments/mean/value",
     "moments/mean/rest",
@@ -36,7 +38,8 @@ def as_stored(wanted: Mapping[str, Any], saved: Iterable[str]) -> Leaves:
 
     It is `wanted` itself unless the checkpoint is an old one.
     """
-    stored = dict(wanted)
+    saved = set(saved)
+    stored = {path: leaf for path, leaf in wanted.items() if path in saved or path not in _ADDED}
     for prefix, names in _old_parts(saved):
         if prefix + _NEW[0] in wanted:
             new = {name: stored.pop(prefix + name) for name in _NEW}
@@ -49,9 +52,12 @@ def as_stored(wanted: Mapping[str, Any], saved: Iterable[str]) -> Leaves:
     return stored
 
 
-def brought_up(found: Mapping[str, Any]) -> Leaves:
-    """The arrays of today's statistics, {path: array}, from those that `as_stored` named."""
+def brought_up(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> Leaves:
+    """The arrays `wanted`, {path: array}, from those that `as_stored` named for them."""
     out = dict(found)
+    for path in _ADDED:
+        if path in wanted and path not in found:
+            out[path] = jnp.full(wanted[path].shape, jnp.nan, wanted[path].dtype)
     for prefix, names in _old_parts(found):
         old = {name: out.pop(prefix + name) for name in names}
         if "count" in old:  # (task,), the same for all
