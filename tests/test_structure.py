@@ -55,6 +55,7 @@ LIGHT = {
     *(f"config.{name}" for name in ("schema", "rules", "files", "yaml_tree")),
     *(f"storage.{name}" for name in ("run_dir", "documents", "run_files", "run_groups", "locks")),
     "storage.output_files",
+    "analysis.film_options",
     "text.goal_files",
     *(f"evaluation.{name}" for name in ("options", "finetune_options", "cells")),
     *(f"cli.{name}" for name in ("main", "train", "stop_signal", "flags", "goals")),

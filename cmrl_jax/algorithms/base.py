@@ -35,6 +35,9 @@ class Agent(Protocol):
     `memory` is the agent's own pytree with a leading lane axis, what a lane has seen and been told:
     a belief over z, a hidden state, the state of a search.
 
+    It may have `describe(memory) -> list[str]`, too: in a few words for each lane, what its episode
+    is acted on, which films show.
+
     Attributes:
         adapts: whether experience changes what it does.
         explores: whether an episode that it learns from differs from one that counts.

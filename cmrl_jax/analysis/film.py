@@ -21,7 +21,7 @@ from envs.render.frames import Renderer, camera_of, metaworld_scene
 
 CONTROL_RATE = 80  # control steps a second: 5 substeps of 2.5 ms
 WIDTH, HEIGHT, STRIP = 480, 352, 32  # of a frame: picture, and the strip of text below it; pixels
-_SHEET_COLUMNS, _SHEET_ROWS = 6, 3
+_SHEET_COLUMNS = 6
 _TEXT_SIZE = 16
 _SUCCESS = "limegreen"
 
@@ -35,12 +35,14 @@ class Episode:
         qpos: (H + 1, 10) joint positions.
         success: (H + 1,) whether that very step succeeds.
         returns: sum of rewards.
+        acted_on: what the policy knew or tried, in a few words.
     """
 
     name: str
     qpos: np.ndarray
     success: np.ndarray
     returns: float
+    acted_on: str = ""
 
     def verdict(self, step: int) -> str:
         """Whether the episode has succeeded by a step, and when."""
@@ -135,19 +137,25 @@ def _frame(task: str, episode: Episode, step: int, camera: Camera) -> Image.Imag
     return frame
 
 
-def write_sheet(film: Film, camera: Camera, path: Path) -> None:
-    """Writes a PNG: time to the right, and a row an episode (the first, the last, one between)."""
+def write_sheet(film: Film, camera: Camera, path: Path, rows: int = 3) -> None:
+    """Writes a PNG: time to the right, and a row an episode.
+
+    Args:
+        rows: at most so many, the first, the last and what lies evenly between.
+    """
     last = len(film.episodes) - 1
-    rows = np.unique(np.linspace(0, last, _SHEET_ROWS).round().astype(int))
+    shown = np.unique(np.linspace(0, last, min(rows, last + 1)).round().astype(int))
     width, height = WIDTH * 2 // 3, HEIGHT * 2 // 3
-    size = (width * _SHEET_COLUMNS, STRIP + (height + STRIP) * len(rows))
+    size = (width * _SHEET_COLUMNS, STRIP + (height + STRIP) * len(shown))
     sheet = Image.new("RGB", size, "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(_TEXT_SIZE)
     draw.text((8, STRIP // 2), f"{film.task}: {film.caption}", "black", font, "lm")
-    for i, row in enumerate(rows):
+    for i, row in enumerate(shown):
         episode, top = film.episodes[row], STRIP + (height + STRIP) * i
         end = len(episode.qpos) - 1
-        draw.text((8, top + STRIP // 2), f"{episode.name}: {episode.outcome}", "black", font, "lm")
+        words = filter(None, (episode.acted_on, episode.outcome))
+        line = f"{episode.name}: {', '.join(words)}"
+        draw.text((8, top + STRIP // 2), line, "black", font, "lm")
         for column, step in enumerate(np.linspace(0, end, _SHEET_COLUMNS).round().astype(int)):
             picture = Image.fromarray(camera.take(episode, step)).resize((width, height))
             corner = (width * column, top + STRIP)

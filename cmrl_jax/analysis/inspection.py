@@ -84,7 +84,7 @@ def infer(
     """Posteriors of all lanes before any episode and after `K`, and the z's of the one after."""
     inference = learner.inference
     assert inference is not None  # the caller has looked
-    memories = [before for _, before, _ in evaluator.episodes([params], trial, K + 1, seed)]
+    memories = [e.before for e in evaluator.episodes([params], trial, K + 1, seed)]
     texts, lane_id = evaluator.told_of(trial).text[0], evaluator.lanes_of(trial).lane_id
 
     @jax.jit

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from cmrl_jax.analysis.film import Camera, Episode, Film, write_sheet, write_video
+from cmrl_jax.analysis.film_options import FilmOptions
 from cmrl_jax.config.schema import as_config_error
 from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.evaluation.options import EvalOptions
@@ -69,63 +70,53 @@ def _lane(task: int, placement: Any) -> tuple[int, bytes]:
     return task, np.asarray(placement, np.float32).tobytes()
 
 
-def film_run(
-    session: Session,
-    policy: Policy,
-    k: int,
-    goal: int,
-    goal_set: str,
-    seed: int,
-    horizon: int | None,
-    caption: str,
-) -> list[Film]:
-    """Runs k exploration episodes and the reported one of every evaluated task.
+def film_run(session: Session, policy: Policy, options: FilmOptions, caption: str) -> list[Film]:
+    """Runs k exploration episodes and the reported one of every task asked for.
 
     Args:
-        goal: index into the goal set.
         caption: where the policy comes from.
     """
     env = FilmedEnv(session.config.env.goal_observable, session.config.env.obs_mode)
-    tasks = session.eval_tasks
-    evaluator = Evaluator(session.config, env, session.agent, len(tasks), horizon)
-    options = EvalOptions(goals=goal + 1, goal_set=goal_set)
-    trial = trial_of([policy], session, options, tasks).of_goal(goal)
-    scores = evaluator.run([policy.params], trial, range(k + 1), seed)
-    names = [f"exploration {i + 1} of {k}" for i in range(k)] + [f"reported, k = {k}"]
+    tasks, agent = options.tasks or session.eval_tasks, session.agent_of(options.adapt)
+    evaluator = Evaluator(session.config, env, agent, len(tasks), options.horizon)
+    shown = EvalOptions(goals=options.goal + 1, goal_set=options.goal_set, adapt=options.adapt)
+    trial = trial_of([policy], session, shown, tasks).of_goal(options.goal)
+    run, k = [policy.params], options.k
+    played = list(evaluator.episodes(run, trial, k + 1, options.seed, counted=(k,)))
     films = []
     for row, task in enumerate(tasks):
         place = trial.placements[row, 0]
         episodes = tuple(
-            Episode(name, qpos, success, float(scores[i].returns[0, row, 0, 0]))
-            for i, (name, (qpos, success)) in enumerate(
-                zip(names, env.episodes(task, place), strict=True)
+            Episode(
+                f"reported, k = {k}" if e.is_counted else f"exploration {e.number + 1} of {k}",
+                qpos,
+                success,
+                float(e.score.returns[0, row, 0, 0]),
+                acted_on[row],
+            )
+            for e, acted_on, (qpos, success) in zip(
+                played,
+                [_acted_on(agent, e.after) for e in played],
+                env.episodes(task, place),
+                strict=True,
             )
         )
         held_out = "" if task in session.config.tasks.train else "held out, "
-        where = f"{held_out}goal {goal} of '{goal_set}'; {caption}"
+        where = f"{held_out}goal {options.goal} of '{options.goal_set}'; {caption}"
         films.append(Film(task, where, place, episodes))
     return films
 
 
-def render_run(
-    run: Path,
-    k: int,
-    goal: int,
-    goal_set: str,
-    seed: int,
-    horizon: int | None,
-    checkpoint: int | None,
-    every: int,
-    out: Path,
-) -> int:
-    """Writes TASK.mp4 and TASK.png of every evaluated task to `out`; returns the exit code.
+def _acted_on(agent: Any, memory: Any) -> list[str]:
+    """What each lane of the one policy was acted on in an episode, if the agent says so."""
+    of_policy = jax.tree.map(lambda x: x[0], memory)
+    if hasattr(agent, "describe"):
+        return agent.describe(of_policy)
+    return [""] * len(jax.tree.leaves(of_policy)[0])
 
-    Args:
-        k: exploration episodes.
-        goal: index into the goal set.
-        horizon: control steps an episode; None for the run's own.
-        checkpoint: iteration; None for the newest.
-        every: control steps from one frame of a video to the next.
+
+def render_run(run: Path, options: FilmOptions, out: Path) -> int:
+    """Writes TASK.mp4 and TASK.png of every task to `out`; returns the exit code.
 
     Raises:
         ConfigError: no such checkpoint, or it does not fit this program.
@@ -133,15 +124,15 @@ def render_run(
     config = evaluation_config(run, "native")
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
-    policy = load_policy(run, session, checkpoint)
+    policy = load_policy(run, session, options.checkpoint)
     steps = f"iteration {policy.meta['iteration']}, {policy.meta['env_steps']:,} env steps"
     caption = f"{config.name}, {steps}"
-    films = film_run(session, policy, k, goal, goal_set, seed, horizon, caption)
+    films = film_run(session, policy, options, caption)
     for film in films:
         video, sheet = out / f"{film.task}.mp4", out / f"{film.task}.png"
         with Camera(film) as camera, as_config_error():
-            write_video(film, camera, every, video)
-            write_sheet(film, camera, sheet)
+            write_video(film, camera, options.every, video)
+            write_sheet(film, camera, sheet, options.rows)
         sizes = ", ".join(
             f"{path} ({path.stat().st_size / 1000:.0f} kB)" for path in (video, sheet)
         )

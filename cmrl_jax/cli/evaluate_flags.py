@@ -26,6 +26,7 @@ from cmrl_jax.cli.flags import (
 )
 from cmrl_jax.config.schema import MOST_EPISODES, ConfigError
 from cmrl_jax.evaluation.options import (
+    ADAPT,
     DONATED,
     MOST_DRAWS,
     Z_SOURCES,
@@ -50,7 +51,7 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         "--k",
         type=adaptation,
         metavar="0,1,2",
-        help="adaptation episodes [eval.final_k of the run; with --adapt search 0,1,2,5,10,20]",
+        help="adaptation episodes [eval.final_k; but for --adapt posterior 0,1,2,5,10,20]",
     )
     add("--tasks", type=names, metavar="A,B", help="tasks to evaluate [those of the run]")
     add("--goals", type=goal_count, default=GOALS, metavar="N", help="goals a task, 1 to 50 [50]")
@@ -71,9 +72,9 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         "--adapt",
         default="posterior",
         metavar="A",
-        choices=("posterior", "search"),
+        choices=ADAPT,
         help="what own episodes change: posterior: the belief over z; search: which z and which "
-        "mirror of the scene is acted on [posterior]",
+        "mirror of the scene is acted on; arms: a control, the k-th of those [posterior]",
     )
     add(
         "--protocol",

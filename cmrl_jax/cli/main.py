@@ -149,14 +149,14 @@ def _bench(words: list[str]) -> int:
 
 def _render(words: list[str]) -> int:
     parser = parser_of("render", render_flags.DESCRIPTION)
-    options = render_flags.options_of(parse(render_flags.add_flags(parser), words))
+    run, options, out = render_flags.options_of(parse(render_flags.add_flags(parser), words))
 
     from envs.render.frames import choose_gl
 
     call_envs(choose_gl)  # before anything imports mujoco
     from cmrl_jax.analysis import render
 
-    return render.render_run(**options)
+    return render.render_run(run, options, out)
 
 
 def _goals(words: list[str]) -> int:

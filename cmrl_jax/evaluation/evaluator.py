@@ -79,6 +79,25 @@ class _Stage(NamedTuple):
     check: Callable[[], None]
 
 
+class Played(NamedTuple):
+    """One episode of an adaptation run, numpy.
+
+    Attributes:
+        number: of adaptation episodes before it.
+        is_counted: whether it is scored on the trial's goals.
+        before: memories of its lanes (policy, lane, ...) when it began, experience alone.
+        after: the same when it had ended, with what it was acted on.
+        score: Episode of (policy, task, goal, draw); of one goal a task where it is one that a
+            trial's learners play.
+    """
+
+    number: int
+    is_counted: bool
+    before: Any
+    after: Any
+    score: Episode
+
+
 class Evaluator:
     """Runs evaluations with one compiled episode of a fixed number of policies and lanes.
 
@@ -141,8 +160,8 @@ class Evaluator:
             k -> Episode of numpy arrays (policy, task, goal, draw). Its faults are those of the
             adaptation episodes, too.
         """
-        counted = self.episodes(policies, trial, max(k) + 1, seed, check, k)
-        scores = {n: score for n, _, score in counted}
+        played = self.episodes(policies, trial, max(k) + 1, seed, check, k)
+        scores = {episode.number: episode.score for episode in played if episode.is_counted}
         return {n: scores[n] for n in k}
 
     def episodes(
@@ -153,7 +172,7 @@ class Evaluator:
         seed: int,
         check: Callable[[], None] = lambda: None,
         counted: Sequence[int] | None = None,
-    ) -> Iterator[tuple[int, Any, Episode]]:
+    ) -> Iterator[Played]:
         """Plays adaptation runs of `count` episodes, each acted on what those before it showed.
 
         An agent that does not explore learns from the episodes that count, where those are on its
@@ -166,8 +185,8 @@ class Evaluator:
             counted: episodes to score; all by default.
 
         Yields:
-            For each counted episode its number, the memories of all lanes before it, numpy
-            (policy, lane, ...), and its Episode of numpy arrays (policy, task, goal, draw).
+            Every episode that is played, in that order: one that counts comes before the one that
+            is learned from in its place.
         """
         self.compile(policies[0], trial.texts.shape[-1])
         stage = _Stage(
@@ -182,28 +201,31 @@ class Evaluator:
         memories = self._blank(self.told_of(learners))
         faults = np.zeros((self.policies, len(self.lanes_of(learners).lane_id)), np.int32)
         is_apart = trial.adaptation is not None or self._agent.explores
+
+        def played(number, is_counted, before, after, score, of: Trial) -> Played:
+            shape = (len(policies), *of.placements.shape[:2], of.draws)
+            own = lambda x: x[: shape[0]]
+            by_goal = jax.tree.map(lambda x: own(x).reshape(shape), score)
+            before, after = (jax.tree.map(own, x) for x in (before, after))
+            return Played(number, is_counted, before, after, by_goal)
+
         for episode in range(count):
             key = jax.random.fold_in(jax.random.key(seed), episode)
             known, before = take_lanes(memories, heirs), faults[:, heirs]
             is_counted = counted is None or episode in counted
-            if not is_apart:
-                memories, score = self._play(stage, known, source_of, lanes, False, key)
-                faults = faults + score.faults
-            elif is_counted:
-                _, score = self._play(stage, known, source_of, lanes, True, key)
-            if is_counted:
+            if not is_apart or is_counted:
+                after, score = self._play(stage, known, source_of, lanes, is_apart, key)
                 score = score._replace(faults=before + score.faults)
-                shape = (len(policies), *trial.placements.shape[:2], trial.draws)
-                own = lambda x: x[: shape[0]]
-                yield (
-                    episode,
-                    jax.tree.map(own, known),
-                    jax.tree.map(lambda x: own(x).reshape(shape), score),
-                )
+                yield played(episode, is_counted, known, after, score, trial)
+                if not is_apart:
+                    memories, faults = after, score.faults
             if is_apart and episode + 1 < count:
                 places = self.lanes_of(learners, episode)
-                memories, learned = self._play(stage, memories, take_lanes, places, False, key)
-                faults = faults + learned.faults
+                after, score = self._play(stage, memories, take_lanes, places, False, key)
+                faults = faults + score.faults
+                score = score._replace(faults=faults)
+                yield played(episode, False, memories, after, score, learners)
+                memories = after
 
     def _play(
         self,

@@ -26,6 +26,8 @@ from envs.tasks import METAWORLD_TASKS
 
 ZSource = Literal["posterior", "prior", "shuffled", "other", "text"]
 Z_SOURCES: tuple[ZSource, ...] = typing.get_args(ZSource)
+Adapt = Literal["posterior", "search", "arms"]
+ADAPT: tuple[Adapt, ...] = typing.get_args(Adapt)
 DONATED = ("shuffled", "other")  # z from another lane's belief: lanes depend on one another
 SEARCH_K = (0, 1, 2, 5, 10, 20)  # where a search is scored unless --k says otherwise
 # A draw is one of the numbers that name a lane's noise, in 32 bits (`evaluator.lane_names`), and
@@ -50,7 +52,8 @@ class EvalOptions:
         z: what an episode is acted on; posterior is the protocol, the others are controls
             (controls.py).
         adapt: what own episodes change: the belief over z, or which of many z's and mirrors is
-            chosen (`algorithms/cmrl/search.py`).
+            chosen (`algorithms/cmrl/search.py`); arms: a control, after k episodes comes the k-th
+            of those, whatever they earn.
         protocol: goal: each goal is adapted to by itself; task: each draw adapts once, on goals of
             the `train` set, and is scored on all goals.
         paraphrases: sentences of the table, the first trained on or the held-out ones.
@@ -72,7 +75,7 @@ class EvalOptions:
     physics: Literal["mjx", "native", "metaworld"] | None = None
     policy: Literal["deterministic", "sampled"] = "deterministic"
     z: ZSource = "posterior"
-    adapt: Literal["posterior", "search"] = "posterior"
+    adapt: Adapt = "posterior"
     protocol: Literal["goal", "task"] = "goal"
     paraphrases: Literal["train", "heldout"] = "train"
     text_control: Literal["none", "shuffled", "zero"] = "none"
@@ -218,7 +221,7 @@ def ks_of(options: EvalOptions, config: Config) -> tuple[int, ...]:
     """Numbers of adaptation episodes to score at: those asked for, else what is usual."""
     if options.k is not None:
         return options.k
-    return SEARCH_K if options.adapt == "search" else config.eval.final_k
+    return SEARCH_K if options.adapt != "posterior" else config.eval.final_k
 
 
 def evaluated_tasks(options: EvalOptions, config: Config) -> tuple[str, ...]:

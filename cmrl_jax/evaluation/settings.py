@@ -35,8 +35,6 @@ def sentences_of(options: EvalOptions, config: Config) -> str | None:
     """
     if options.text is not None:
         return config.goals.table  # `embed` refuses another encoder's weights
-    if options.adapt == "search":  # its arms are sentences of the table
-        return load_goals(config.goals.table, config.tasks.train).sha256[:12]
     tasks = evaluated_tasks(options, config)
     if options.text_control == "shuffled":
         tasks = tuple(other_task(task) for task in tasks)

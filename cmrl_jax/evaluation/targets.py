@@ -68,7 +68,7 @@ def program_key(target: Target, adapt: str = "posterior") -> str:
     if rules.is_told_the_task:
         told = config.tasks.train
     else:  # a search has arms for each training task
-        told = len(config.tasks.train) if adapt == "search" else 0
+        told = 0 if adapt == "posterior" else len(config.tasks.train)
     return repr((acting, told, target.k))
 
 

@@ -114,8 +114,8 @@ def trial_of(
     Raises:
         ConfigError: a sentence that cannot be had, or a goal set that cannot be read.
     """
-    if options.adapt == "search" and any(map(_is_incomplete, policies)):
-        cause = "--adapt search with a policy that was saved before there was a search"
+    if options.adapt != "posterior" and any(map(_is_incomplete, policies)):
+        cause = f"--adapt {options.adapt} with a policy that was saved before there was a search"
         raise ConfigError(cause, "resume its run, whose next policy has what is searched")
     texts = [task_sentences(policy, session.config, options, tasks) for policy in policies]
     return Trial(

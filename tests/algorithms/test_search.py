@@ -11,7 +11,7 @@ from learner_fixtures import ACT, GOALS, LATENT, OBS, TASKS, build, tiny_config
 from cmrl_jax.algorithms.base import Told
 from cmrl_jax.algorithms.cmrl.agent import PolicyParams
 from cmrl_jax.algorithms.cmrl.learner import Learner
-from cmrl_jax.algorithms.cmrl.search import BUDGET, Rule, SearchAgent, round_starts
+from cmrl_jax.algorithms.cmrl.search import BUDGET, ArmsInTurn, Rule, SearchAgent, round_starts
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.nn.context import init_belief
 
@@ -130,6 +130,15 @@ def test_an_episode_that_counts_takes_the_best_arm_and_teaches_nothing(made, par
         best = [max(range(known), key=lambda arm: constant(lane, arm)[0]) for lane in range(LANES)]
         assert (trial.play(exploit=True) == best).all()
         jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.asarray, trial.memory))
+
+
+def test_arms_in_turn_are_played_whatever_they_earn(made, params):
+    trial = Trial(made, params, constant)
+    trial.agent = ArmsInTurn(made.learner, STEPS, MIRRORS)
+    trial.begin = jax.jit(trial.agent.begin_episode)
+    for arm in [*range(ARMS), 0, 1]:
+        assert (trial.play(exploit=True) == arm).all()
+        assert (trial.play() == arm).all()
 
 
 def test_the_rule_decides_what_is_best(made, params):

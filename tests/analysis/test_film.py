@@ -16,6 +16,7 @@ from policy_fixtures import save_run
 
 from cmrl_jax.algorithms.cmrl.agent import PolicyParams
 from cmrl_jax.analysis.film import HEIGHT, STRIP, WIDTH, Episode
+from cmrl_jax.analysis.film_options import FilmOptions
 from cmrl_jax.analysis.render import FilmedEnv, film_run
 from cmrl_jax.config.files import load_config, to_yaml
 from cmrl_jax.evaluation.evaluator import Evaluator
@@ -72,7 +73,8 @@ def test_filmed_states_are_metaworlds():
 def test_a_film_is_the_evaluation_itself(session, params):
     """The returns of the evaluator on an environment that keeps nothing."""
     vectors = dict(zip(session.eval_tasks, session.goals.vectors[:, 0], strict=True))
-    films = film_run(session, Policy(params, vectors, {}), 1, 1, "heldout", 5, 20, "a policy")
+    options = FilmOptions(k=1, goal=1, seed=5, horizon=20)
+    films = film_run(session, Policy(params, vectors, {}), options, "a policy")
     evaluator = Evaluator(session.config, session.env, session.agent, lanes=8, horizon=20)
     scores = evaluator.run([params], session.trial("heldout", 2), (0, 1), seed=5)
     assert [film.task for film in films] == list(session.eval_tasks)
@@ -85,6 +87,19 @@ def test_a_film_is_the_evaluation_itself(session, params):
             assert episode.qpos.shape == (21, 10)
     first, second = films[0].episodes
     assert not np.array_equal(first.qpos, second.qpos)  # another z
+    assert first.acted_on.startswith("z ") and first.acted_on != second.acted_on
+
+
+def test_a_filmed_search_says_what_it_tries(session, params):
+    vectors = dict(zip(session.eval_tasks, session.goals.vectors[:, 0], strict=True))
+    options = FilmOptions(k=4, adapt="search", tasks=("window-close",), horizon=10)
+    [film] = film_run(session, Policy(params, vectors, {}), options, "a policy")
+    *tried, reported = film.episodes
+    names = ["own z", *(f"z of {task}" for task in session.config.tasks.train)]
+    assert [e.acted_on for e in tried] == names  # smoke.yaml sees no mirrors
+    best = max(tried, key=lambda e: e.returns)
+    assert reported.acted_on == best.acted_on and reported.name == "reported, k = 4"
+    np.testing.assert_allclose(reported.returns, best.returns, rtol=1e-5)
 
 
 def test_an_evaluation_needs_no_gl(session, tmp_path):

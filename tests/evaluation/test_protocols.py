@@ -40,6 +40,11 @@ class Tally:
 
 def played(explores, adaptation=None, **options):
     """(k, memories before, scores) of each counted episode of one policy, and the goals."""
+    found, goals = every_episode(explores, adaptation, **options)
+    return [(e.number, e.before, e.score) for e in found if e.is_counted], goals
+
+
+def every_episode(explores, adaptation=None, **options):
     goals = np.random.default_rng(0).uniform(-0.5, 0.5, (2, GOALS, 2)).astype(np.float32)
     texts = np.zeros((1, 2, GOALS, 1), np.float32)
     trial = Trial(TASKS, goals, texts, draws=DRAWS, adaptation=adaptation)
@@ -77,6 +82,24 @@ def test_by_task_a_draw_learns_once_for_all_goals():
             np.testing.assert_allclose(places(memory), wanted, rtol=1e-4, atol=1e-6)
             reward = HORIZON * np.minimum(np.array([-1, 1])[:, None] * goals[..., 0], 0.5)
             np.testing.assert_allclose(scores.returns[0, :, :, 1], reward, rtol=1e-4)
+
+
+def test_every_episode_is_told_of_in_turn():
+    """One that is learned from comes after the one that counts in its place, and scores its own."""
+    found, _ = every_episode(False, counted=(1,))
+    assert [(e.number, e.is_counted) for e in found] == [(k, k == 1) for k in range(EPISODES)]
+    adaptation = np.random.default_rng(1).uniform(-0.5, 0.5, (2, DRAWS, EPISODES, 2))
+    found, _ = every_episode(True, adaptation, counted=(0, EPISODES - 1))
+    order = [(0, True), *((k, False) for k in range(EPISODES - 1)), (EPISODES - 1, True)]
+    assert [(e.number, e.is_counted) for e in found] == order
+    for e in found:
+        np.testing.assert_array_equal(e.after["learns"], not e.is_counted)
+        if not e.is_counted:
+            learned = adaptation[:, :, e.number, 0]
+            reward = HORIZON * np.minimum(np.array([[-1], [1]]) * learned, 0.5)
+            np.testing.assert_allclose(e.score.returns[0, :, 0], reward, rtol=1e-4)
+            after = np.asarray(e.after["places"] - e.before["places"]).reshape(2, DRAWS)
+            np.testing.assert_allclose(after, learned, rtol=1e-4, atol=1e-6)
 
 
 def test_only_what_is_asked_for_is_scored():

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from cmrl_jax.algorithms.base import RunState, Told
@@ -156,6 +157,12 @@ class CmrlAgent:
             params.encoder_params, memory.belief, normalized, mask, memory.text, memory.text_mask
         )
         return replace(memory, belief=belief)
+
+    def describe(self, memory: Memory) -> list[str]:
+        """The z of each lane's episode; nothing without a latent."""
+        if self.learner.inference is None:
+            return [""] * len(memory.conditioning)
+        return ["z " + " ".join(f"{x:.1f}" for x in z) for z in np.asarray(memory.conditioning)]
 
 
 def z_noise(keys: jax.Array, latent_dim: int) -> jax.Array:

@@ -11,7 +11,7 @@ from cmrl_jax.algorithms.base import Agent, Algorithm, RunState
 from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, make_policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
 from cmrl_jax.algorithms.cmrl.learner import Learner
-from cmrl_jax.algorithms.cmrl.search import SearchAgent
+from cmrl_jax.algorithms.cmrl.search import ArmsInTurn, SearchAgent
 from cmrl_jax.config.schema import Config
 from envs.base import MetaEnv
 
@@ -33,6 +33,7 @@ def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
     agents: dict[str, Agent] = {"posterior": CmrlAgent(learner, config.collect.chunk)}
     if learner.inference is not None:
         agents["search"] = SearchAgent(learner, config.collect.chunk, env.symmetries)
+        agents["arms"] = ArmsInTurn(learner, config.collect.chunk, env.symmetries)
     return Algorithm(
         agents=agents,
         init=lambda key: init_run(config, env, learner, key),

@@ -52,7 +52,7 @@ class Rules(AlgorithmRules):
         self.adapts = conditioning == "z"
         self.reads_text = self.adapts and fusion != "none"
         self.can_start_from_text = self.adapts and fusion in ("factor", "both")
-        self.ways = ("posterior", "search") if self.adapts else ("posterior",)
+        self.ways = ("posterior", "search", "arms") if self.adapts else ("posterior",)
         self.is_told_the_task = conditioning == "task_id"
         self.kind = f"model.conditioning {conditioning}"
         if self.adapts:

@@ -136,7 +136,7 @@ class SearchAgent:
         del keys  # nothing is drawn
         memory, source = _credited(memory), _credited(source)
         order = self._order(source)
-        tried = jnp.where(exploit, _best(source), self._next(source, order))
+        tried = self._chosen(source, order, exploit)
         z = self._z_of(params, source, tried // self.mirrors)
         learns = jnp.where(exploit, jnp.zeros_like(memory.learns), 1.0)
         return replace(memory, order=order, arm=tried, learns=learns, z=z)
@@ -172,6 +172,20 @@ class SearchAgent:
         earned = jnp.sum(transitions.reward * kept, -1)
         return replace(memory, score=before + (earned if rate == 0 else rate * earned))
 
+    def describe(self, memory: SearchMemory) -> list[str]:
+        """The arm of each lane's episode: whose z, and which actions are mirrored."""
+        names = ("own z", *(f"z of {task}" for task in self.learner.config.tasks.train))
+        flipped = [np.flatnonzero(signs < 0) for signs in np.asarray(self.symmetries[1])]
+        mirrors = [
+            f", mirrored in action {' '.join(map(str, f))}" if len(f) else "" for f in flipped
+        ]
+        which = [divmod(int(arm), self.mirrors) for arm in np.asarray(memory.arm)]
+        return [names[z] + mirrors[mirror] for z, mirror in which]
+
+    def _chosen(self, memory: SearchMemory, order: jax.Array, exploit: jax.Array) -> jax.Array:
+        """The arm (lane,) of the episode that begins."""
+        return jnp.where(exploit, _best(memory), self._next(memory, order))
+
     def _order(self, memory: SearchMemory) -> jax.Array:
         """The order of the round at hand: anew from what is known where a round begins."""
         done = jnp.sum(memory.plays, -1)
@@ -196,6 +210,18 @@ class SearchAgent:
             params.encoder_params, nothing, memory.text, memory.text_mask
         ).mean
         return jnp.where((which == 0)[..., None], own, params.task_z[which - 1])
+
+
+class ArmsInTurn(SearchAgent):
+    """The arms one after another, whatever they earn: after k episodes comes arm k.
+
+    A control: scored at every k it says what each arm is worth by itself, and so what the best one
+    is, and one taken at random.
+    """
+
+    def _chosen(self, memory: SearchMemory, order: jax.Array, exploit: jax.Array) -> jax.Array:
+        del order, exploit
+        return jnp.sum(memory.plays, -1).astype(jnp.int32) % self.arms
 
 
 def _credited(memory: SearchMemory) -> SearchMemory:
