@@ -17,7 +17,7 @@ from cmrl_jax.algorithms.base import Algorithm as Algorithm
 from cmrl_jax.config.files import load_config as load_config
 from cmrl_jax.config.files import to_yaml
 from cmrl_jax.config.rules import validate
-from cmrl_jax.config.schema import Config, ConfigError, call_envs
+from cmrl_jax.config.schema import Config, ConfigError, call_envs, require
 from cmrl_jax.evaluation.options import EvalOptions, check_options, check_run
 from cmrl_jax.evaluation.results import Evaluation, score
 from cmrl_jax.evaluation.session import Policy, Session, load_policy, prepare_jax
@@ -28,7 +28,7 @@ from cmrl_jax.registry import register_environment as register_environment
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.run_dir import begun, check_same_config, find_run, new_run
 from cmrl_jax.training import trainer
-from cmrl_jax.training.loggers import Console, Logger, with_tensorboard
+from cmrl_jax.training.loggers import Console, Logger, loggers_of
 from cmrl_jax.training.metrics import read_rows
 from envs.base import MetaEnv as MetaEnv
 
@@ -105,6 +105,9 @@ def train(
             that holds another run, a damaged checkpoint.
     """
     validate(config)
+    for logger in loggers or ():
+        cause = f"a logger is a {type(logger).__name__}, which is no cmrl_jax.Logger"
+        require(isinstance(logger, Logger), cause, "make its class a subclass: class Mine(Logger)")
     if resume:
         if run_dir is None:
             raise ConfigError("resume without a run directory", "name it: run_dir=")
@@ -113,7 +116,7 @@ def train(
     else:
         run = new_run(config.name, None if run_dir is None else Path(run_dir))
     if loggers is None:
-        loggers = with_tensorboard(Console(progress=False), config)
+        loggers = loggers_of(Console(progress=False), config)
     with begun(run, to_yaml(config), resume):
         outcome = trainer.train(config, run, loggers, stop, resume)
     return TrainResult(run, outcome.iteration, outcome.is_finished, outcome.evaluation)

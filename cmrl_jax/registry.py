@@ -53,6 +53,21 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
 }
 
 
+ENVIRONMENT_PARTS = (
+    "observation_size",
+    "action_size",
+    "goal_size",
+    "tasks",
+    "can_terminate",
+    "symmetries",
+    "reset",
+    "reset_to",
+    "step",
+    "goals",
+)
+"""The attributes of `envs.base.MetaEnv`, which this module does not import."""
+
+
 def register_environment(
     name: str, tasks: Mapping[str, str], make: str | Callable[[Any], Any]
 ) -> None:
@@ -108,8 +123,16 @@ def algorithm(name: str) -> AlgorithmEntry:
 
 
 def make_environment(options: Any) -> Any:
-    """Builds what the `env` section of a configuration names: a `MetaEnv`."""
-    return _loaded(environment(options.name).make)(options)
+    """Builds what the `env` section of a configuration names: a `MetaEnv`.
+
+    Raises:
+        ValueError: what was built lacks a part of one (two lines: cause, cure).
+    """
+    env = _loaded(environment(options.name).make)(options)
+    if missing := [part for part in ENVIRONMENT_PARTS if not hasattr(env, part)]:
+        cause = f"environment '{options.name}' ({type(env).__name__}) has no {missing[0]}"
+        raise ValueError(f"{cause}\ngive it all that envs.base.MetaEnv lists")
+    return env
 
 
 def make_algorithm(config: Any, env: Any, goal_vectors: Any) -> Any:
@@ -155,6 +178,8 @@ def other_task(task: str) -> str:
 def _found(entries: Mapping[str, Any], name: str, kind: str) -> Any:
     if name not in entries:
         valid = f"valid: {', '.join(entries)}"
+        if kind != "task":
+            valid += "; one of your own is known once it is registered in this process"
         raise ValueError(f"unknown {kind} '{name}'\n{suggest(name, entries)}{valid}")
     return entries[name]
 

@@ -7,7 +7,7 @@ from envs.goal_sets import load_goal_set
 from envs.parity.parts import Port
 from envs.parity.reference import Rollout, record_rollout
 from envs.sawyer import Ml4Env
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 GOALS_A_TASK = 3
 LANES = GOALS_A_TASK * len(TASKS)

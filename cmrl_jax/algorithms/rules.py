@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from cmrl_jax.config.schema import Config
+from cmrl_jax.config.schema import Config, require
 
 
 class AlgorithmRules:
@@ -48,7 +48,18 @@ class AlgorithmRules:
         )
 
     def check(self) -> None:
-        """Raises ConfigError for the first combination that cannot be trained."""
+        """Raises ConfigError for the first combination that cannot be trained.
+
+        One that does not adapt can be scored on its training tasks alone, before any episode.
+        """
+        if self.adapts:
+            return
+        test, evaluation = self.config.tasks.test, self.config.eval
+        cause = f"tasks.test is {list(test)} with {self.kind}, which does not adapt"
+        require(not test, cause, "set tasks.test: []")
+        for key, ks in (("eval.k", evaluation.k), ("eval.final_k", evaluation.final_k)):
+            cause = f"{key} {list(ks)} with {self.kind}, which does not adapt"
+            require(not any(ks), cause, f"set {key}: [0]")
 
     def check_devices(self, devices: int) -> None:
         """Raises ConfigError unless the work divides evenly among the devices."""

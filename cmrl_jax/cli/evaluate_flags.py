@@ -29,7 +29,7 @@ from cmrl_jax.evaluation.options import (
     ADAPT,
     DONATED,
     MOST_DRAWS,
-    Z_SOURCES,
+    Z_CONTROLS,
     EvalOptions,
     check_options,
     check_run,
@@ -90,9 +90,8 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         "--z",
         default="posterior",
         metavar="Z",
-        choices=Z_SOURCES,
-        help="posterior; prior: no text, no experience; shuffled: another lane's posterior; other: "
-        "another task's; text: no experience [posterior]",
+        choices=tuple(Z_CONTROLS),
+        help="; ".join(f"{name}: {z.help}" for name, z in Z_CONTROLS.items()) + " [posterior]",
     )
     add(
         "--paraphrases",

@@ -104,11 +104,11 @@ def _in_console(config: Config, run: Path, stop: Stop, resume: bool) -> int:
     """Trains, and says how it ended; returns the exit code."""
     from cmrl_jax.formats import format_duration
     from cmrl_jax.training import trainer
-    from cmrl_jax.training.loggers import Console, with_tensorboard
+    from cmrl_jax.training.loggers import Console, loggers_of
 
     # Who cannot be told what happens has left: the run saves and ends.
     console = Console(config.log.progress, on_error=stop.request)
-    loggers = with_tensorboard(console, config)
+    loggers = loggers_of(console, config)
     outcome = trainer.train(config=config, run_dir=run, loggers=loggers, stop=stop, resume=resume)
     if outcome.is_finished:
         console.message(f"done in {format_duration(outcome.wall_s)}: {run}")

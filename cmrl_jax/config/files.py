@@ -265,12 +265,12 @@ def _replace(config: Config, dotted: str, value: Any) -> Config:
         ConfigError: no such key, or a value that it cannot have.
     """
     data: Any = to_dict(config)
-    owner, cls = data, Config
+    owner, cls, prefix = data, Config, ""
     *sections, key = dotted.split(".")
     for section in sections:
         if not is_dataclass(field_types(cls).get(section)):
-            _unknown(section, dotted, cls, "")
-        owner, cls = owner[section], field_types(cls)[section]
+            _unknown(section, prefix + section, cls, "")
+        owner, cls, prefix = owner[section], field_types(cls)[section], f"{prefix}{section}."
     hint = field_types(cls).get(key)
     if hint is None or is_dataclass(hint):
         _unknown(key, dotted, cls, "")

@@ -31,6 +31,9 @@ def validate(config: Config) -> None:
     _check_eval(config)
     cause = "train.env_steps and train.minutes are both 0: the run would never end"
     require(bool(config.train.env_steps or config.train.minutes), cause, "set one of them")
+    lanes, trained = config.collect.lanes, len(config.tasks.train)
+    cause = f"collect.lanes {lanes} is not divisible by the {trained} training tasks"
+    require(lanes % trained == 0, cause, f"set collect.lanes: {-(-lanes // trained) * trained}")
     call_envs(lambda: rules_of(config)).check()
 
 

@@ -8,7 +8,7 @@ registry's matter (`registry.other_task`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal, assert_never
 
 import jax
 import numpy as np
@@ -31,14 +31,25 @@ def sources(
         told: what the lanes are told (policy, lane, ...).
         blank: the memories of lanes that have seen nothing.
     """
-    if z == "text":
-        inexperienced = blank(told)
-        return lambda _, index: take_lanes(inexperienced, index)
-    if z == "prior":
-        ignorant = blank(told._replace(text_mask=np.zeros_like(told.text_mask)))
-        return lambda _, index: take_lanes(ignorant, index)
-    donor = donors(z, lanes.lane_id, lanes.env_task)
-    return lambda memories, index: take_lanes(memories, donor[index])
+    match z:
+        case "posterior":
+            return take_lanes
+        case "text" | "prior":
+            blanks = without_experience(z, told, blank)
+            return lambda _, index: take_lanes(blanks, index)
+        case "shuffled" | "other":
+            donor = donors(z, lanes.lane_id, lanes.env_task)
+            return lambda memories, index: take_lanes(memories, donor[index])
+        case _:
+            assert_never(z)
+
+
+def without_experience(
+    z: Literal["text", "prior"], told: Told, blank: Callable[[Told], Any]
+) -> Any:
+    """Memories of lanes that have seen nothing; with `prior` they are told nothing, either."""
+    mask = np.zeros_like(told.text_mask) if z == "prior" else told.text_mask
+    return blank(told._replace(text_mask=mask))
 
 
 def take_lanes(memories: Any, index: np.ndarray) -> Any:
@@ -46,12 +57,14 @@ def take_lanes(memories: Any, index: np.ndarray) -> Any:
     return jax.tree.map(lambda x: x[:, index], memories)
 
 
-def donors(z: str, lane_id: np.ndarray, env_task: np.ndarray) -> np.ndarray:
+def donors(
+    z: Literal["shuffled", "other"], lane_id: np.ndarray, env_task: np.ndarray
+) -> np.ndarray:
     """The lane whose memory each lane acts on, (lane,) indices.
 
     Args:
         z: `shuffled` takes another lane of the whole evaluation, tasks mixed; `other` the same
-            goal and draw of the next task; every other source the lane itself.
+            goal and draw of the next task.
         lane_id: (lane,), each once.
         env_task: (lane,).
     """
@@ -60,7 +73,7 @@ def donors(z: str, lane_id: np.ndarray, env_task: np.ndarray) -> np.ndarray:
         # A cycle through all lanes in random order: nobody is left with their own.
         cycle = np.argsort(lane_id)[np.random.default_rng(_SHUFFLE_SEED).permutation(len(own))]
         own[cycle] = np.roll(cycle, -1)
-    elif z == "other":
+    else:
         by_lane = np.lexsort((lane_id, env_task)).reshape(len(np.unique(env_task)), -1)
         own[by_lane] = np.roll(by_lane, -1, axis=0)
     return own

@@ -158,6 +158,8 @@ def agent_of(
     """The agent of a trial of one task, whose adaptation runs take these lanes of it in turn."""
     names, train = lane_names(trial, session.env.tasks), session.config.tasks.train
     [task] = trial.tasks
+    if trial.z == "shuffled" or trial.z == "other":  # `check_options` has looked
+        raise ValueError(f"z {trial.z}: lanes know nothing of each other here")
     env: Any = session.env  # Meta-World's own: `ml4`
     texts = np.repeat(trial.texts[0, 0], trial.draws, axis=0)  # (lane, G)
     return MetaWorldAgent(

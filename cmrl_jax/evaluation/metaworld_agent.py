@@ -20,7 +20,7 @@ NOTES
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from cmrl_jax.algorithms.base import Agent, Told
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.algorithms.common.rollout import select_lanes
 from cmrl_jax.config.schema import EnvConfig
+from cmrl_jax.evaluation.controls import without_experience
 from cmrl_jax.evaluation.episode import action_noise, agent_keys, chunk_keys
 from envs.sawyer import OBJECT, Ml4Env, canonical_obs
 
@@ -77,7 +78,7 @@ class MetaWorldAgent:
         reset_lag: np.ndarray,
         horizon: int,
         seed: int = 0,
-        z: str = "posterior",
+        z: Literal["posterior", "text", "prior"] = "posterior",
         deterministic: bool = True,
     ):
         self._agent, self._texts, self._lane_ids, self._z = agent, texts, lane_ids, z
@@ -105,9 +106,10 @@ class MetaWorldAgent:
         lanes, horizon = self._lanes, self._horizon
         text = self._texts[self._run % len(self._texts)].astype(np.float32)
         self._lane_id = self._lane_ids[self._run % len(self._lane_ids)].astype(np.int32)
-        self._memory = self._agent.init(Told(text, np.ones(lanes, np.float32), self._row))
-        mask = np.full(lanes, self._z != "prior", np.float32)
-        self._control = self._agent.init(Told(text, mask, self._row))
+        told = Told(text, np.ones(lanes, np.float32), self._row)
+        self._memory = self._agent.init(told)
+        if self._z != "posterior":
+            self._control = without_experience(self._z, told, self._agent.init)
         self._frozen = False
         self._episode = np.zeros(lanes, np.int32)
         self._starts = np.ones(lanes, bool)  # the next observation is an episode's first

@@ -5,7 +5,7 @@ from __future__ import annotations
 import typing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from cmrl_jax.commands import shown
 from cmrl_jax.config.files import run_config
@@ -24,11 +24,30 @@ from envs.command_line import LARGEST, brief, suggest, what_is
 from envs.goal_names import GOALS, LARGEST_SEED
 from envs.tasks import METAWORLD_TASKS
 
+
+class ZControl(NamedTuple):
+    """A way to choose what an episode is acted on: a value of `--z`.
+
+    Attributes:
+        help: in a few words.
+        is_donated: whether it is another lane's belief, so that lanes depend on one another.
+    """
+
+    help: str
+    is_donated: bool = False
+
+
 ZSource = Literal["posterior", "prior", "shuffled", "other", "text"]
-Z_SOURCES: tuple[ZSource, ...] = typing.get_args(ZSource)
+Z_CONTROLS: dict[ZSource, ZControl] = {
+    "posterior": ZControl("the own experience"),
+    "prior": ZControl("no text, no experience"),
+    "shuffled": ZControl("another lane's posterior", is_donated=True),
+    "other": ZControl("another task's", is_donated=True),
+    "text": ZControl("no experience"),
+}
+DONATED = tuple(name for name, control in Z_CONTROLS.items() if control.is_donated)
 Adapt = Literal["posterior", "search", "arms"]
 ADAPT: tuple[Adapt, ...] = typing.get_args(Adapt)
-DONATED = ("shuffled", "other")  # z from another lane's belief: lanes depend on one another
 SEARCH_K = (0, 1, 2, 5, 10, 20)  # where a search is scored unless --k says otherwise
 # A draw is one of the numbers that name a lane's noise, in 32 bits (`evaluator.lane_names`), and
 # every lane keeps its text in memory.
@@ -185,12 +204,12 @@ def check_run(options: EvalOptions, run: Path) -> Config:
     if not rules.adapts:
         told = f"with {rules.kind} ({run})"
         if any(k):
-            raise ConfigError(f"--k {shown(k)} {told}", "give --k 0: only a latent z can adapt")
+            raise ConfigError(f"--k {shown(k)} {told}", "give --k 0: it does not adapt")
         if options.z != "posterior":
             raise ConfigError(f"--z {options.z} {told}", "leave --z out: the policy has no latent")
         if options.adaptation_episodes not in (0, EvalOptions.adaptation_episodes):
             cause = f"--adaptation-episodes {options.adaptation_episodes} {told}"
-            raise ConfigError(cause, "leave it out: only a latent z can adapt")
+            raise ConfigError(cause, "leave it out: it does not adapt")
         for task in tasks:
             cure = f"use its training tasks: {', '.join(config.tasks.train)}"
             require(

@@ -129,7 +129,8 @@ def check_unused(run: Path) -> None:
     call_envs(lambda: what_is(run / RUN_FILES[0]))
     if holds_run(run):
         cause = f"run directory {run} already holds a run"
-        raise ConfigError(cause, "add --resume to go on with it, or give another --run DIR")
+        cure = "go on with it (--resume, in a program resume=True), or give another --run DIR"
+        raise ConfigError(cause, cure)
 
 
 def forget_unbegun(run: Path) -> None:

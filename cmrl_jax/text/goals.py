@@ -59,7 +59,8 @@ class GoalTable:
             if task not in self.tasks:
                 raise ConfigError(
                     f"the goal table {self.encoder} has no task '{task}'",
-                    f"{suggest(task, self.tasks)}its tasks: {', '.join(self.tasks)}",
+                    f"{suggest(task, self.tasks)}its tasks: {', '.join(self.tasks)}; for others "
+                    "build a table (python train.py goals), or set goals.table: one-hot",
                 )
         rows = [self.tasks.index(task) for task in tasks]
         return replace(

@@ -48,7 +48,7 @@ class Progress:
 
 
 class Logger:
-    """What a logger is told, in this order; a method that it lacks is not its business."""
+    """What a logger is told, in this order. Yours is a subclass with the methods that it needs."""
 
     def start(self, run: RunInfo) -> None:
         """The run begins, or goes on."""
@@ -188,7 +188,7 @@ class TensorBoard(Logger):
             self._writer.close()
 
 
-def with_tensorboard(console: Console, config: Config) -> list[Logger]:
+def loggers_of(console: Console, config: Config) -> list[Logger]:
     """The console, and TensorBoard where `log.tensorboard` asks for it."""
     return [console, *([TensorBoard()] if config.log.tensorboard else [])]
 

@@ -187,6 +187,35 @@ class Runner:
         return {"seen": memory["seen"] + jnp.sum(mask, -1)}
 
 
+OWN = "; one of your own is known once it is registered in this process"
+
+
+def test_what_an_environment_lacks_is_named_before_any_compile(monkeypatch):
+    monkeypatch.delattr(PointEnv, "symmetries")
+    with pytest.raises(cj.ConfigError, match=r"environment 'point' \(PointEnv\) has no symmetries"):
+        cj.make_env(cj.load_config("smoke", SMALL | BOTH))
+
+
+def test_a_policy_that_does_not_adapt_is_asked_for_nothing_else():
+    """Whatever the algorithm: no test task, no adaptation episode, as many lanes as tasks."""
+    for changed, cause in (
+        ({"tasks.test": ["point-left"]}, "tasks.test is .* which does not adapt"),
+        ({"eval.final_k": [0, 1]}, r"eval.final_k \[0, 1\] .* which does not adapt"),
+        ({"tasks.train": ["point-left", "point-right"], "collect.lanes": 1}, "not divisible by"),
+    ):
+        with pytest.raises(cj.ConfigError, match=cause):
+            cj.load_config("smoke", LINEAR | changed)
+
+
+def test_a_logger_is_one(tmp_path):
+    class Rows:
+        def row(self, row, progress): ...
+
+    with pytest.raises(cj.ConfigError, match="a logger is a Rows, which is no cmrl_jax.Logger"):
+        cj.train(cj.load_config("smoke", LINEAR), tmp_path / "run", loggers=[Rows()])  # pyright: ignore
+    assert not (tmp_path / "run").exists()
+
+
 def test_an_environment_and_its_tasks_have_names_of_their_own():
     with pytest.raises(ValueError, match="environment 'point' is registered"):
         cj.register_environment("point", {"a": "a"}, point_env.make)
@@ -196,9 +225,11 @@ def test_an_environment_and_its_tasks_have_names_of_their_own():
         cj.register_environment("other", {"down": "up"}, point_env.make)
     with pytest.raises(cj.ConfigError, match="unknown environment 'pont'") as error:
         cj.load_config("smoke", {"env.name": "pont"})
-    assert error.value.cure == "did you mean 'point'? valid: ml4, point"
+    assert (
+        error.value.cure == f"did you mean 'point'? valid: {', '.join(registry.ENVIRONMENTS)}{OWN}"
+    )
     with pytest.raises(cj.ConfigError, match="unknown task 'window-open' in tasks.train"):
         cj.load_config("smoke", SMALL | {"tasks.train": ["window-open"]})
     with pytest.raises(cj.ConfigError, match="unknown algorithm 'cmlr'") as error:
         cj.load_config("smoke", {"algorithm": "cmlr"})
-    assert error.value.cure == "did you mean 'cmrl'? valid: cmrl, linear"
+    assert error.value.cure == f"did you mean 'cmrl'? valid: {', '.join(registry.ALGORITHMS)}{OWN}"

@@ -26,7 +26,7 @@ from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
 from envs.goal_sets import load_goal_set
 from envs.parity.reference import record_rollout
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 ROOT = Path(__file__).parents[2]
 STEPS = 100  # the scripted policies have succeeded by then

@@ -13,7 +13,7 @@ from cmrl_jax.analysis import plots
 from cmrl_jax.analysis.plots import Runs, band, read_metrics, series
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.schema import ConfigError
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 ROOT = Path(__file__).parents[2]
 # One panel is drawn faster than four.

@@ -7,7 +7,7 @@ import pytest
 
 import envs
 from envs.physics.mjx.backend import MjxPhysics
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 HORIZON, LANES, STEPS = 3, 4, 8
 

@@ -26,7 +26,7 @@ from envs.physics.model import (
     load_fixture,
     load_scene,
 )
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 from envs.tasks.specs import SPECS
 
 SCENE = {task: spec.scene for task, spec in zip(TASKS, SPECS, strict=True)}

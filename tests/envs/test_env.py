@@ -11,7 +11,7 @@ from envs.goal_sets import load_goal_set
 from envs.parity.parts import draw_noise, port_episodes, reference_episodes
 from envs.parity.reference import ReferenceEnv
 from envs.sawyer import OBJECT, Ml4Env
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 from envs.tasks.specs import SPECS
 
 

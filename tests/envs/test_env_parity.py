@@ -9,7 +9,7 @@ from env_fixtures import GOALS_A_TASK, LANES
 from envs.parity import __main__ as parity
 from envs.parity import parts as parity_parts
 from envs.parity.report import finite, table
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 RUN = ("--goals", str(GOALS_A_TASK), "--horizon", "12")
 CLOSED = ("success_any", "success_last", "return_ratio", "reference_success_any")

@@ -5,7 +5,7 @@ from env_fixtures import GOALS, LANE_GOALS, LANE_TASKS, LANES
 
 from envs.parity import parts as parity_parts
 from envs.parity.reference import ReferenceEnv
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 from envs.tasks.base import HAND_HIGH, HAND_LOW
 
 # Hand targets (m; x, y, z from the fixture unless the third row says table) and finger effort, by

@@ -13,11 +13,13 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS, ML1_args_kwargs
 
 from envs import goal_names, goal_sets
 from envs.goal_sets import SEEDS, draw_goals, load_goal_set
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
+from envs.tasks import REGISTRY
 from envs.tasks.specs import SPECS
 
 BOXES = {
-    task: (spec.placement_low, spec.placement_high) for task, spec in zip(TASKS, SPECS, strict=True)
+    task: (spec.placement_low, spec.placement_high)
+    for task, spec in zip(REGISTRY, SPECS, strict=True)
 }
 
 

@@ -20,7 +20,7 @@ from cmrl_jax.jax_runtime import jit_once
 from envs.parity.reference import ReferenceEnv, scripted_policy
 from envs.physics.native import NativePhysics, unpack
 from envs.sawyer import OBS_MODES, Ml4Env, State
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 from envs.tasks.specs import SCENE_ID, SPECS
 
 STEPS = 150

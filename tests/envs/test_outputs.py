@@ -19,7 +19,7 @@ from envs.command_line import brief
 from envs.outputs import check_output, replacing, save_figure, write_json, written_by
 from envs.parity import __main__ as parity
 from envs.render import picture
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 MARK = written_by("eval")
 

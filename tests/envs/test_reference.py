@@ -9,7 +9,7 @@ import pytest
 from envs.goal_sets import load_goal_set
 from envs.parity import reference
 from envs.parity.reference import ReferenceEnv, record_rollout, scripted_policy
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 GOALS = dict(zip(TASKS, load_goal_set("heldout", TASKS), strict=True))
 

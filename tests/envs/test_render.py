@@ -27,7 +27,7 @@ from envs.physics.model import (
 from envs.render import port_scene
 from envs.render.frames import camera_of, metaworld_scene
 from envs.render.picture import half_way
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 from envs.tasks.specs import SPECS
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,8 @@ from envs.parity.parts import SUCCESS_DISTANCE, THRESHOLD_BAND
 from envs.parity.reference import ReferenceEnv
 from envs.rewards import gaussian, hamacher_product, long_tail
 from envs.sawyer import Ml4Env
-from envs.tasks import TASKS, task_id
+from envs.tasks import METAWORLD_TASKS as TASKS
+from envs.tasks import task_id
 
 SLIDE = 9
 SLIDES = {"drawer-open": (-0.17, 0.0), "drawer-close": (-0.17, 0.0)}

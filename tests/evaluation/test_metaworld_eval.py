@@ -31,7 +31,7 @@ from cmrl_jax.evaluation.session import Policy, Session
 from envs.adapters.metaworld_envs import make_vector_env, set_goals
 from envs.parity.reference import record_rollout
 from envs.sawyer import OBS_SIZE
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 LANES = 2
 

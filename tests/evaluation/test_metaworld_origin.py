@@ -16,7 +16,8 @@ from cmrl_jax.evaluation.metaworld import agent_of, k_shot, of_task
 from cmrl_jax.evaluation.session import Policy, Session
 from envs.adapters.metaworld_envs import make_vector_env, set_goals
 from envs.sawyer import OBJECT
-from envs.tasks import TASKS, task_id
+from envs.tasks import METAWORLD_TASKS as TASKS
+from envs.tasks import task_id
 
 LANES = 2
 

@@ -15,7 +15,7 @@ from cmrl_jax.text import encoders, goal_builder, minilm
 from cmrl_jax.text.encoders import embed, file_sha256
 from cmrl_jax.text.goal_files import table_path
 from cmrl_jax.text.goals import load_goals, read_table
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "tiny_bert.npz"
 

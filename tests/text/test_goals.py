@@ -13,7 +13,7 @@ from cmrl_jax.text import goal_files
 from cmrl_jax.text.goal_builder import all_vectors, read_prompts, task_cosines
 from cmrl_jax.text.goal_files import PROMPTS_FILE, table_path
 from cmrl_jax.text.goals import check_same_table, load_goals, read_table
-from envs.tasks import TASKS
+from envs.tasks import METAWORLD_TASKS as TASKS
 
 MINILM = table_path("minilm-l6-v2")
 

@@ -70,18 +70,7 @@ class Rules(AlgorithmRules):
         """Raises ConfigError for the first combination that cannot be trained."""
         _check_model(self.config)
         _check_sizes(self.config)
-        self._check_adaptation()
-
-    def _check_adaptation(self) -> None:
-        config = self.config
-        if self.adapts:
-            return
-        cause = f"tasks.test is {list(config.tasks.test)} with {self.kind}"
-        cure = "set tasks.test: [], only a latent z can adapt to a task not trained on"
-        require(not config.tasks.test, cause, cure)
-        for key, ks in (("eval.k", config.eval.k), ("eval.final_k", config.eval.final_k)):
-            cause = f"{key} {list(ks)} with {self.kind}"
-            require(not any(ks), cause, f"set {key}: [0], only a latent z can adapt")
+        super().check()
 
     def check_devices(self, devices: int) -> None:
         """Raises ConfigError unless lanes, rings and batches divide evenly among the devices."""
@@ -147,10 +136,7 @@ def _check_model(config: Config) -> None:
 
 
 def _check_sizes(config: Config) -> None:
-    collect, tasks, horizon = config.collect, len(config.tasks.train), config.env.horizon
-    cause = f"collect.lanes {collect.lanes} is not divisible by the {tasks} training tasks"
-    up = -(-collect.lanes // tasks) * tasks
-    require(collect.lanes % tasks == 0, cause, f"set collect.lanes: {up}")
+    collect, horizon = config.collect, config.env.horizon
     shares, lanes = collect.group_frac, lanes_per_task(config)
     cause = f"collect.group_frac {list(shares)} sums to {sum(shares):g}"
     require(abs(sum(shares) - 1) < 1e-6, cause, "give three shares that sum to 1")

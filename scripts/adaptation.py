@@ -1,0 +1,217 @@
+"""The adaptation table: `python scripts/adaptation.py train`, then `score`, then `table`.
+
+Each of the four tasks is held out once, a fold, with five seeds. `train` makes the runs, one after
+another; what is finished is left alone and what was stopped goes on, so it can be stopped and given
+again at any time. Runs go to runs/adaptation/NAME; config, versions, command and the last policy of
+each are copied to results/adaptation/policies/NAME. `score` evaluates those copies, one JSON an
+evaluation in results/adaptation/scores/NAME; what is there already is not run again. `table` puts
+them together as results/adaptation/folds.json, the figures and the Markdown of README. `--list`
+prints every command. Names after the word choose among the runs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT)]
+
+from cmrl_jax.config.schema import ConfigError  # noqa: E402
+from cmrl_jax.storage.documents import read_json  # noqa: E402
+from cmrl_jax.storage.run_files import EVALUATION  # noqa: E402
+from scripts.experiments import refused  # noqa: E402
+
+RUNS, RESULTS = Path("runs/adaptation"), Path("results/adaptation")
+POLICIES, SCORES = RESULTS / "policies", RESULTS / "scores"
+TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
+SEEDS = range(5)
+K = (0, 1, 2, 5, 10, 20)
+
+# What is trained in every fold. PEARL sees what the others see and begins as they do, so that only
+# the method differs; the networks of `untrained` are as initialised: iteration 0 learns nothing.
+KINDS = {
+    "cmrl": "--config ml4.yaml --train.env_steps 1000000",
+    "pearl": "--config pearl.yaml --env.obs_mode canonical --collect.scatter 40"
+    " --train.env_steps 1000000",
+    "untrained": "--config ml4.yaml --train.env_steps 19200",
+}
+_K = f"--k {','.join(map(str, K))}"
+_TASK = "--protocol task --eval-seeds 10"  # ten adaptation runs, each on goals in its own order
+EVALUATIONS = {
+    "search-task": f"--adapt search {_K} {_TASK}",
+    "search-goal": f"--adapt search {_K}",
+    "posterior-task": f"{_K} {_TASK}",
+    "posterior-goal": f"{_K}",
+    "arms": "--adapt arms --k " + ",".join(map(str, range(16))),
+    "text-shuffled": "--k 0 --text-control shuffled",
+    "text-zero": "--k 0 --text-control zero",
+    "trained": "--k 0",
+    "trained-search": "--adapt search --k 20",
+}
+OF_KIND = {
+    "cmrl": tuple(EVALUATIONS),
+    "pearl": ("posterior-task", "posterior-goal", "search-task", "search-goal", "trained"),
+    "untrained": ("search-task", "search-goal"),
+}
+
+
+def runs() -> list[str]:
+    """Names of all runs, KIND-FOLD-sSEED, the seeds of a fold last: each sweep has every fold."""
+    return [f"{kind}-{fold}-s{seed}" for kind, seed, fold in itertools.product(KINDS, SEEDS, TASKS)]
+
+
+def parts(name: str) -> tuple[str, str, int]:
+    """Kind, fold and seed of a run's name."""
+    kind, _, rest = name.partition("-")
+    fold, _, seed = rest.rpartition("-s")
+    return kind, fold, int(seed)
+
+
+def train_command(name: str) -> list[str]:
+    """What a user would type for a run."""
+    kind, fold, seed = parts(name)
+    train = ",".join(task for task in TASKS if task != fold)
+    words = ["train.py", *shlex.split(KINDS[kind]), "--tasks.train", train, "--tasks.test", fold]
+    words += ["--env.physics", "native", "--seed", str(seed), "--run", str(RUNS / name)]
+    return words + (["--resume"] if (RUNS / name / "config.yaml").exists() else [])
+
+
+def score_command(name: str, evaluation: str) -> list[str]:
+    """What a user would type for an evaluation of a run's kept policy."""
+    _, fold, _ = parts(name)
+    trained = ",".join(task for task in TASKS if task != fold)
+    tasks = trained if evaluation.startswith("trained") else fold
+    words = ["train.py", "eval", "--run", str(POLICIES / name), "--tasks", tasks]
+    words += ["--physics", "native", *shlex.split(EVALUATIONS[evaluation])]
+    return [*words, "--json", str(SCORES / name / f"{evaluation}.json")]
+
+
+def keep(name: str) -> None:
+    """Copies what scoring needs of a finished run: the policy saved last and its facts."""
+    run, kept = RUNS / name, POLICIES / name
+    last = max(int(path.name) for path in (run / "policy").iterdir() if path.name.isdigit())
+    shutil.rmtree(kept, ignore_errors=True)
+    shutil.copytree(run / "policy" / str(last), kept / "policy" / str(last))
+    for file in ("config.yaml", "versions.json"):
+        shutil.copy(run / file, kept / file)
+    spoken = f"python {shlex.join(train_command(name)).removesuffix(' --resume')}\n"
+    (kept / "command.txt").write_text(spoken, encoding="utf-8")
+
+
+def train(names: list[str]) -> int:
+    """Makes the runs that are missing; the exit code of one that was stopped."""
+    for name in names:
+        if not (RUNS / name / EVALUATION).exists():
+            print(f"== {name}", flush=True)
+            code = subprocess.run([sys.executable, *train_command(name)], cwd=ROOT).returncode
+            if code or not (RUNS / name / EVALUATION).exists():
+                return code or 1
+        if not (POLICIES / name).exists():
+            keep(name)
+    return 0
+
+
+def score(names: list[str]) -> int:
+    """Makes the evaluations that are missing of the policies that are there."""
+    for name in names:
+        for evaluation in OF_KIND[parts(name)[0]]:
+            out = SCORES / name / f"{evaluation}.json"
+            if out.exists() or not (POLICIES / name).exists():
+                continue
+            out.parent.mkdir(parents=True, exist_ok=True)
+            print(f"== {name} {evaluation}", flush=True)
+            command = [sys.executable, *score_command(name, evaluation)]
+            if code := subprocess.run(command, cwd=ROOT).returncode:
+                return code
+    return 0
+
+
+METHODS = {  # of (kind, adapt)
+    ("cmrl", "search"): "cmrl",
+    ("cmrl", "posterior"): "cmrl-posterior",
+    ("pearl", "posterior"): "pearl",
+    ("pearl", "search"): "pearl-search",
+    ("untrained", "search"): "untrained-search",
+}
+
+
+def rows_of(name: str) -> list[dict[str, Any]]:
+    """The rows of a run's evaluations."""
+    kind, fold, seed = parts(name)
+    rows: list[dict[str, Any]] = []
+
+    def add(method: str, protocol: str, k: int, figures: dict[str, Any]) -> None:
+        row = {"fold": fold, "method": method, "protocol": protocol, "seed": seed, "k": k}
+        rows.append(row | {x: figures[x] for x in ("success_any", "success_last")})
+
+    for adapt, protocol in itertools.product(("search", "posterior"), ("task", "goal")):
+        for k, figures in figures_of(name, f"{adapt}-{protocol}", fold).items():
+            add(METHODS[kind, adapt], protocol, k, figures)
+    for text in ("shuffled", "zero"):
+        for k, figures in figures_of(name, f"text-{text}", fold).items():
+            add(f"cmrl-text-{text}", "goal", k, figures)
+    if arms := list(figures_of(name, "arms", fold).values()):
+        mirrors = len(arms) // len(TASKS)  # of each z: the task's own, and three trained ones
+        fixed = {
+            "random-arm": mean(arms),
+            "blind-arm": mean(arms[mirrors::mirrors]),  # a trained task's z, nothing mirrored
+            "oracle-arm": max(arms, key=lambda f: (f["success_any"], f["success_last"])),
+        }
+        # What does not adapt is the same whatever it has seen.
+        for (method, figures), k, protocol in itertools.product(fixed.items(), K, ("task", "goal")):
+            add(method, protocol, k, figures)
+    return rows
+
+
+def figures_of(name: str, evaluation: str, task: str) -> dict[int, dict[str, Any]]:
+    """k -> figures on a task; nothing where it was not evaluated."""
+    path = SCORES / name / f"{evaluation}.json"
+    if not path.exists():
+        return {}
+    found = read_json(path, "remove it, and score again")["tasks"][task]
+    return {int(k): figures for k, figures in found.items()}
+
+
+def mean(arms: list[dict[str, Any]]) -> dict[str, float]:
+    return {x: sum(f[x] for f in arms) / len(arms) for x in ("success_any", "success_last")}
+
+
+def table(names: list[str]) -> int:
+    """Writes folds.json from the evaluations that are there."""
+    rows = [row for name in names for row in rows_of(name)]
+    (RESULTS / "folds.json").write_text(json.dumps({"rows": rows}, indent=0) + "\n")
+    print(f"{RESULTS / 'folds.json'}: {len(rows)} rows")
+    return 0
+
+
+STEPS = {"train": train, "score": score, "table": table}
+
+
+def main(words: list[str]) -> int:
+    if "--list" in words:
+        for name in runs():
+            print(f"python {shlex.join(train_command(name))}")
+            for evaluation in OF_KIND[parts(name)[0]]:
+                print(f"python {shlex.join(score_command(name, evaluation))}")
+        return 0
+    step, chosen = words[:1], words[1:]
+    if not step or step[0] not in STEPS:
+        return refused(f"what to do: {' '.join(step) or 'not said'}", f"say {', '.join(STEPS)}")
+    unknown = [word for word in chosen if word not in runs()]
+    if unknown:
+        return refused(f"no run {unknown[0]}", "see --list for their names")
+    return STEPS[step[0]](chosen or runs())
+
+
+if __name__ == "__main__":
+    try:
+        raise SystemExit(main(sys.argv[1:]))
+    except ConfigError as error:
+        raise SystemExit(refused(error.cause, error.cure)) from None
