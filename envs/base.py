@@ -51,8 +51,9 @@ class MetaEnv(Protocol):
         goal_size: numbers of a goal (where the target is, say), which an episode is reset to.
         tasks: names; a task's place is its id.
         can_terminate: whether a step may end an episode for good.
-        symmetries: signs of observations (symmetry, observation_size) and of actions (symmetry,
-            action_size): each a mirror in which the scene could be as well, the identity first.
+        symmetries: orthogonal matrices that observations (symmetry, observation_size,
+            observation_size) and actions (symmetry, action_size, action_size) are multiplied by
+            where the scene is seen mirrored or turned, the identity first.
     """
 
     observation_size: int

@@ -25,6 +25,19 @@ from envs.tasks.specs import SCENE_ID, SPECS
 
 OBS_SIZE, ACTION_SIZE, FRAME = 39, 4, 18
 HAND, OBJECT, QUATERNION = slice(0, 3), slice(4, 7), slice(7, 11)  # of a frame
+PLANE_SYMMETRIES = np.array(
+    [
+        [[1, 0], [0, 1]],
+        [[-1, 0], [0, 1]],
+        [[1, 0], [0, -1]],
+        [[-1, 0], [0, -1]],
+        [[0, 1], [-1, 0]],
+        [[0, -1], [1, 0]],
+        [[0, 1], [1, 0]],
+        [[0, -1], [-1, 0]],
+    ],
+    np.float32,
+)
 OBS_MODES = ("metaworld", "canonical")
 
 
@@ -180,20 +193,19 @@ class Ml4Env:
 
     @property
     def symmetries(self) -> tuple[np.ndarray, np.ndarray]:
-        """Planar mirrors about the object's place: none, x, y, both.
+        """The eight of a square, in the plane about the object's place: mirrors, then turns.
 
-        Only canonical observations have their origin there; others have the identity alone.
+        Only canonical observations have their origin there; others have the identity alone. The
+        gripper itself does not turn: its fingers open along one axis.
         """
-        mirrors = [(1, 1), (-1, 1), (1, -1), (-1, -1)]
-        if self.obs_mode != "canonical":
-            mirrors = mirrors[:1]
-        of_obs = np.ones((len(mirrors), OBS_SIZE), np.float32)
-        of_action = np.ones((len(mirrors), ACTION_SIZE), np.float32)
+        count = len(PLANE_SYMMETRIES) if self.obs_mode == "canonical" else 1
+        of_obs = np.tile(np.eye(OBS_SIZE, dtype=np.float32), (count, 1, 1))
+        of_action = np.tile(np.eye(ACTION_SIZE, dtype=np.float32), (count, 1, 1))
         places = [start + part.start for start in (0, FRAME) for part in (HAND, OBJECT)]
-        for row, signs in enumerate(mirrors):
-            of_action[row, :2] = signs
+        for row, matrix in enumerate(PLANE_SYMMETRIES[:count]):
             for place in (*places, 2 * FRAME):
-                of_obs[row, place : place + 2] = signs
+                of_obs[row, place : place + 2, place : place + 2] = matrix
+            of_action[row, :2, :2] = matrix
         return of_obs, of_action
 
     def goals(self, name: str, tasks: Sequence[str] = TASKS) -> np.ndarray:

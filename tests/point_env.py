@@ -38,7 +38,7 @@ class PointEnv:
     observation_size, action_size, goal_size = 3, 2, 2
     tasks = tuple(TASKS)
     can_terminate = True
-    symmetries = np.ones((1, 3), np.float32), np.ones((1, 2), np.float32)
+    symmetries = np.eye(3, dtype=np.float32)[None], np.eye(2, dtype=np.float32)[None]
 
     def reset(self, key: jax.Array, task_id: jax.Array) -> PointState:
         return self.reset_to(task_id, jax.random.uniform(key, (2,), minval=-0.2, maxval=0.2))

@@ -81,7 +81,8 @@ class MetaWorldAgent:
         z: Literal["posterior", "text", "prior"] = "posterior",
         deterministic: bool = True,
     ):
-        self._agent, self._texts, self._lane_ids, self._z = agent, texts, lane_ids, z
+        self._agent, self._texts, self._lane_ids = agent, texts, lane_ids
+        self._z: Literal["posterior", "text", "prior"] = z
         self._lanes, self._horizon = lane_ids.shape[1], horizon
         self._row = np.full(self._lanes, train_row, np.int32)
         self._reset_lag = reset_lag

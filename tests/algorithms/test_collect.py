@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from cmrl_jax.algorithms.cmrl.collect import imposed_actions, make_noise_scale
@@ -36,7 +37,7 @@ def test_a_single_lane_of_a_task_covers_it_over_episodes():
 def imposed(scatter, is_first):
     config = config_of(96)
     config = replace(config, collect=replace(config.collect, scatter=scatter))
-    return map(np.asarray, imposed_actions(config, 4, jax.random.key(0), np.bool_(is_first)))
+    return map(np.asarray, imposed_actions(config, 4, jax.random.key(0), jnp.bool_(is_first)))
 
 
 def test_an_episode_begins_with_up_to_so_many_steps_of_one_random_action():

@@ -209,7 +209,7 @@ def test_force_is_handed_on(here, replace_module):
     words = ["--run", "run", "--out", "D"]
     with pytest.raises(ConfigError):
         render_flags.options_of(parse(flags, words))
-    assert render_flags.options_of(parse(flags, [*words, "--force"]))["out"] == Path("D")
+    assert render_flags.options_of(parse(flags, [*words, "--force"]))[2] == Path("D")
 
 
 def test_figures_of_goals_are_drawn_again_and_forced_without_a_table_made(here, monkeypatch):

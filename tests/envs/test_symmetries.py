@@ -1,34 +1,41 @@
-"""The mirrors of the scene: what an agent sees and does in them."""
+"""The symmetries of the scene: what an agent sees and does in each."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.sawyer import ACTION_SIZE, OBS_SIZE, Ml4Env, canonical_obs
+from envs.sawyer import ACTION_SIZE, OBS_SIZE, PLANE_SYMMETRIES, Ml4Env, canonical_obs
 
 
-def test_only_canonical_observations_have_mirrors():
+def test_only_canonical_observations_can_be_turned():
     of_obs, of_action = Ml4Env(physics="native").symmetries
-    assert of_obs.shape == (1, OBS_SIZE) and of_action.shape == (1, ACTION_SIZE)
-    assert (of_obs == 1).all() and (of_action == 1).all()
+    np.testing.assert_array_equal(of_obs, np.eye(OBS_SIZE)[None])
+    np.testing.assert_array_equal(of_action, np.eye(ACTION_SIZE)[None])
 
 
-MIRRORS = [(1, 1), (-1, 1), (1, -1), (-1, -1)]
+def test_they_are_the_eight_of_a_square():
+    found = {tuple(matrix.ravel()) for matrix in PLANE_SYMMETRIES}
+    assert len(found) == 8 and (PLANE_SYMMETRIES[0] == np.eye(2)).all()
+    for first in PLANE_SYMMETRIES:
+        np.testing.assert_array_equal(first @ first.T, np.eye(2))
+        for second in PLANE_SYMMETRIES:
+            assert tuple((first @ second).ravel()) in found
 
 
-@pytest.mark.parametrize(("mirror", "signs"), list(enumerate(MIRRORS)))
-def test_a_mirrored_scene_is_seen_as_its_own_signs_say(mirror, signs):
-    """Hand, object and goal on the other side of where the object stood: the same numbers."""
+@pytest.mark.parametrize("view", range(8))
+def test_a_turned_scene_is_seen_as_its_own_matrix_says(view):
+    """Hand, object and goal turned about where the object stood: the same numbers."""
     of_obs, of_action = Ml4Env(physics="native", obs_mode="canonical").symmetries
     rng = np.random.default_rng(0)
     obs, origin = rng.normal(size=OBS_SIZE), rng.normal(size=3)
     obs[11:18] = obs[29:36] = 0
     there = obs.copy()
     for start in (0, 4, 18, 22, 36):
-        for axis, sign in enumerate(signs):
-            place = start + axis
-            there[place] = origin[axis] + sign * (obs[place] - origin[axis])
+        place = slice(start, start + 2)
+        there[place] = origin[:2] + PLANE_SYMMETRIES[view] @ (obs[place] - origin[:2])
     seen = np.asarray(canonical_obs(jnp.asarray(obs), jnp.asarray(origin), True))
-    mirrored = np.asarray(canonical_obs(jnp.asarray(there), jnp.asarray(origin), True))
-    np.testing.assert_allclose(mirrored, of_obs[mirror] * seen, atol=1e-5)
-    assert of_action[mirror].tolist() == [*signs, 1, 1]
+    turned = np.asarray(canonical_obs(jnp.asarray(there), jnp.asarray(origin), True))
+    np.testing.assert_allclose(turned, of_obs[view] @ seen, atol=1e-5)
+    np.testing.assert_array_equal(of_action[view][:2, :2], PLANE_SYMMETRIES[view])
+    np.testing.assert_array_equal(of_action[view][2:, 2:], np.eye(2))
+    assert not of_action[view][:2, 2:].any() and not of_action[view][2:, :2].any()

@@ -253,8 +253,10 @@ def test_donors(goals):
     assert dict(zip(env_task, env_task[other], strict=True)) == {0: 2, 2: 3, 3: 0}
     # Places are read from the lanes' names: another order of lanes, the same donors.
     back = slice(None, None, -1)
-    for z, donor in (("shuffled", shuffled), ("other", other)):
-        found = donors(z, lane_id[back], env_task[back])
+    for found, donor in (
+        (donors("shuffled", lane_id[back], env_task[back]), shuffled),
+        (donors("other", lane_id[back], env_task[back]), other),
+    ):
         wanted = dict(zip(lane_id, lane_id[donor], strict=True))
         assert dict(zip(lane_id[back], lane_id[back][found], strict=True)) == wanted
 

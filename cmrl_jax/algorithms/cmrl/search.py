@@ -1,17 +1,18 @@
-"""Adaptation by search: which z, and which reflection of the scene, earns most on the task at hand.
+"""Adaptation by search: which z, and which view of the scene, earns most on the task at hand.
 
-An arm is a z and a symmetry of the environment (`MetaEnv.symmetries`): the z of the task's own
-sentence (the prior's mean without text) and that of every training task, each seen in every mirror.
-Exploring episodes try arms by successive halving (Karnin et al. 2013: sequential halving): all of
-them once, then fewer and fewer of the best. A counted episode takes the best arm so far and teaches
-nothing. Arms are judged by rewards alone. Everything is data in the compiled episode, so one
-program plays any budget.
+An arm is a z and a symmetry of the environment (`MetaEnv.symmetries`), a view: the z of the task's
+own sentence (the prior's mean without text) or that of a training task, acting in the scene as it
+is seen mirrored or turned. Exploring episodes try the task's own z in every view, then the training
+tasks' in the best of those, then the best arms again by successive halving (Karnin et al. 2013:
+sequential halving). A counted episode takes the best arm so far and teaches nothing. Arms are
+judged by their returns alone. Everything is data in the compiled episode, so one program plays any
+budget.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +26,6 @@ from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.nn.context import init_belief
 
 BUDGET = 20  # exploring episodes that the rounds are laid out for
-LATE_STEPS = 50.0  # over which late rewards are averaged, the last ones most
-
-Rule = Literal["return", "late"]
 
 
 @struct.dataclass
@@ -38,11 +36,11 @@ class SearchMemory:
         text: (lane, G).
         text_mask: (lane,).
         plays: (lane, arm) float32, exploring episodes of each arm.
-        credit: (lane, arm) sum of their scores.
+        credit: (lane, arm) sum of their returns.
         order: (lane, arm) int32, arms in the order in which the round at hand tries them.
         arm: (lane,) int32, of the episode at hand.
         learns: (lane,) float32, 1 where the episode at hand is to be credited.
-        score: (lane,) of the episode at hand so far.
+        returns: (lane,) of the episode at hand so far.
         z: (lane, latent), of the episode at hand.
     """
 
@@ -53,26 +51,33 @@ class SearchMemory:
     order: jax.Array
     arm: jax.Array
     learns: jax.Array
-    score: jax.Array
+    returns: jax.Array
     z: jax.Array
 
 
-def round_starts(arms: int, budget: int = BUDGET) -> tuple[int, ...]:
-    """After how many exploring episodes each round of the halving begins.
+class Rounds(NamedTuple):
+    """How a search spends its exploring episodes.
 
-    The first tries every arm; each later one spends half of what is left on at most half of the
-    arms, at least one episode.
-
-    Returns:
-        Ascending numbers from 0; the last is the end of the last round.
+    Attributes:
+        views: of the best ones, in which the training tasks' z are tried.
+        starts: after how many episodes each round begins, ascending from 0: the own z in every
+            view, the training tasks' in `views` of them, then rounds of the best arms so far, each
+            half of what is left and at most half of the arms tried; the last is the end.
     """
-    starts, left = [0], max(budget - arms, 0)
-    done = arms
-    while left > 0:
+
+    views: int
+    starts: tuple[int, ...]
+
+
+def rounds_of(views: int, tasks: int, budget: int = BUDGET) -> Rounds:
+    """The rounds for a number of views and of training tasks; a quarter is kept for the last."""
+    kept = max(1, min(views, (budget - views) * 3 // 4 // tasks))
+    tried = done = views + kept * tasks
+    starts = [0, views]
+    while done < budget:
         starts.append(done)
-        size = max(1, min(left // 2, arms // 2))
-        done, left = done + size, left - size
-    return (*starts, done)
+        done += max(1, min((budget - done) // 2, tried // 2))
+    return Rounds(kept, (*starts, done))
 
 
 @dataclass(frozen=True)
@@ -82,28 +87,28 @@ class SearchAgent:
     Args:
         learner: with a latent.
         chunk: control steps between two calls of `observe`.
-        symmetries: signs of observations (symmetry, obs) and of actions (symmetry, act), the
-            identity first.
-        rule: what an episode is scored by: its return, or its late rewards, an exponential average
-            over about `LATE_STEPS` steps that starts at 0 and is read where the episode ends.
+        symmetries: of the environment, the identity first.
     """
 
     learner: Learner
     chunk: int
     symmetries: tuple[np.ndarray, np.ndarray]
-    rule: Rule = "return"
 
     adapts = True
     explores = True
 
     @property
-    def mirrors(self) -> int:
+    def views(self) -> int:
         return len(self.symmetries[0])
 
     @property
+    def rounds(self) -> Rounds:
+        return rounds_of(self.views, self.learner.num_tasks)
+
+    @property
     def arms(self) -> int:
-        """Their number; arm a is z a div N, the task's own first, in mirror a mod N of N."""
-        return (1 + self.learner.num_tasks) * self.mirrors
+        """Their number; arm a is z a div N, the task's own first, in view a mod N of N."""
+        return (1 + self.learner.num_tasks) * self.views
 
     def init(self, told: Told) -> SearchMemory:
         lead, inference = told.task_row.shape, self._inference
@@ -116,7 +121,7 @@ class SearchAgent:
             order=jnp.broadcast_to(jnp.arange(self.arms), by_arm.shape),
             arm=jnp.zeros(lead, jnp.int32),
             learns=jnp.zeros(lead),
-            score=jnp.zeros(lead),
+            returns=jnp.zeros(lead),
             z=jnp.zeros((*lead, inference.latent_dim)),
         )
 
@@ -137,7 +142,7 @@ class SearchAgent:
         memory, source = _credited(memory), _credited(source)
         order = self._order(source)
         tried = self._chosen(source, order, exploit)
-        z = self._z_of(params, source, tried // self.mirrors)
+        z = self._z_of(params, source, tried // self.views)
         learns = jnp.where(exploit, jnp.zeros_like(memory.learns), 1.0)
         return replace(memory, order=order, arm=tried, learns=learns, z=z)
 
@@ -149,38 +154,35 @@ class SearchAgent:
         noise: jax.Array,
         deterministic: Any,
     ) -> jax.Array:
-        of_obs, of_action = (jnp.asarray(signs) for signs in self.symmetries)
-        mirror = memory.arm % self.mirrors
-        action, _ = self.learner.policy(
+        of_obs, of_action = (jnp.asarray(matrix)[self._view(memory)] for matrix in self.symmetries)
+        seen, _ = self.learner.policy(
             params.actor_params,
             params.obs_stats,
-            obs * of_obs[mirror],
+            jnp.einsum("...ij,...j->...i", of_obs, obs),
             memory.z,
             None,
             deterministic,
             noise,
         )
-        return action * of_action[mirror]
+        return jnp.einsum("...ij,...i->...j", of_action, seen)  # back: the inverse is the transpose
+
+    def _view(self, memory: SearchMemory) -> jax.Array:
+        return memory.arm % self.views
 
     def observe(
         self, params: PolicyParams, memory: SearchMemory, transitions: Transition, mask: jax.Array
     ) -> SearchMemory:
-        rate = 0.0 if self.rule == "return" else 1.0 / LATE_STEPS
-        steps = jnp.cumsum(mask[:, ::-1], -1)[:, ::-1]  # that count, from each one on
-        before = memory.score * (1.0 - rate) ** steps[:, 0]
-        kept = jnp.where(mask > 0, (1.0 - rate) ** (steps - 1.0), 0.0)
-        earned = jnp.sum(transitions.reward * kept, -1)
-        return replace(memory, score=before + (earned if rate == 0 else rate * earned))
+        earned = jnp.sum(transitions.reward, -1, where=mask > 0)
+        return replace(memory, returns=memory.returns + earned)
 
     def describe(self, memory: SearchMemory) -> list[str]:
-        """The arm of each lane's episode: whose z, and which actions are mirrored."""
+        """The arm of each lane's episode: whose z, and in which view but the identity."""
         names = ("own z", *(f"z of {task}" for task in self.learner.config.tasks.train))
-        flipped = [np.flatnonzero(signs < 0) for signs in np.asarray(self.symmetries[1])]
-        mirrors = [
-            f", mirrored in action {' '.join(map(str, f))}" if len(f) else "" for f in flipped
-        ]
-        which = [divmod(int(arm), self.mirrors) for arm in np.asarray(memory.arm)]
-        return [names[z] + mirrors[mirror] for z, mirror in which]
+        words = []
+        for arm in np.asarray(memory.arm):
+            z, view = divmod(int(arm), self.views)
+            words.append(names[z] + (f", view {view} of {self.views - 1}" if view else ""))
+        return words
 
     def _chosen(self, memory: SearchMemory, order: jax.Array, exploit: jax.Array) -> jax.Array:
         """The arm (lane,) of the episode that begins."""
@@ -188,16 +190,26 @@ class SearchAgent:
 
     def _order(self, memory: SearchMemory) -> jax.Array:
         """The order of the round at hand: anew from what is known where a round begins."""
-        done = jnp.sum(memory.plays, -1)
-        starts = jnp.array(round_starts(self.arms)[1:])
-        begins = jnp.any(done[..., None] == starts, -1) | (done > starts[-1])
+        done, (_, second, *later) = jnp.sum(memory.plays, -1)[..., None], self.rounds.starts
         ranked = jnp.argsort(-_means(memory), axis=-1).astype(jnp.int32)
-        return jnp.where(begins[..., None], ranked, memory.order)
+        begins = jnp.any(done == jnp.array(later), -1, keepdims=True) | (done > later[-1])
+        order = jnp.where(begins, ranked, memory.order)
+        return jnp.where(done == second, self._trained_in_best_views(memory), order)
+
+    def _trained_in_best_views(self, memory: SearchMemory) -> jax.Array:
+        """Arms of the training tasks' z in the best views of the own z; the rest is not tried."""
+        tasks, kept = self.learner.num_tasks, self.rounds.views
+        views = jnp.argsort(-_means(memory)[..., : self.views], axis=-1)[..., :kept]
+        z = 1 + np.arange(tasks)
+        arms = z * self.views + views[..., None]  # (lane, view, z)
+        arms = arms.reshape(*arms.shape[:-2], -1).astype(jnp.int32)
+        rest = [(0, 0)] * (arms.ndim - 1) + [(0, self.arms - arms.shape[-1])]
+        return jnp.pad(arms, rest)
 
     def _next(self, memory: SearchMemory, order: jax.Array) -> jax.Array:
         """The arm that the round at hand tries next; after the last round the best one."""
         done = jnp.sum(memory.plays, -1)
-        starts = jnp.array(round_starts(self.arms))
+        starts = jnp.array(self.rounds.starts)
         begun = jnp.max(jnp.where(starts <= done[..., None], starts, 0), -1)
         place = jnp.where(done >= starts[-1], 0, done - begun).astype(jnp.int32)
         return jnp.take_along_axis(order, place[..., None], -1)[..., 0]
@@ -227,18 +239,17 @@ class ArmsInTurn(SearchAgent):
 def _credited(memory: SearchMemory) -> SearchMemory:
     """The memory with the episode that has ended credited to its arm, if it was to be."""
     played = jax.nn.one_hot(memory.arm, memory.plays.shape[-1]) * memory.learns[..., None]
-    score = jnp.where(played > 0, memory.score[..., None], 0.0)
     return replace(
         memory,
         plays=memory.plays + played,
-        credit=memory.credit + score,
+        credit=memory.credit + played * memory.returns[..., None],
         learns=jnp.zeros_like(memory.learns),
-        score=jnp.zeros_like(memory.score),
+        returns=jnp.zeros_like(memory.returns),
     )
 
 
 def _means(memory: SearchMemory) -> jax.Array:
-    """Mean score of each arm (lane, arm); -inf for one that was never tried."""
+    """Mean return of each arm (lane, arm); -inf for one that was never tried."""
     mean = memory.credit / jnp.maximum(memory.plays, 1.0)
     return jnp.where(memory.plays > 0, mean, -jnp.inf)
 
