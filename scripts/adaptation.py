@@ -39,7 +39,7 @@ K = (0, 1, 2, 5, 10, 20)
 KINDS = {
     "cmrl": "--config ml4.yaml --train.env_steps 1000000",
     "pearl": "--config pearl.yaml --env.obs_mode canonical --collect.scatter 40"
-    " --train.env_steps 1000000",
+    " --train.capacity 340000 --train.env_steps 1000000",
     "untrained": "--config ml4.yaml --train.env_steps 19200",
 }
 _K = f"--k {','.join(map(str, K))}"

@@ -29,15 +29,16 @@ CSV_ROWS = 100  # kept of a run's metrics
 
 BUDGET = "--env.physics native --train.env_steps 1200000"
 SINGLE = "--config sac.yaml --env.physics native"  # 500,000 env steps
-CMRL = f"--config ml4.yaml {BUDGET}"
+CMRL = f"--config ml4-plain.yaml {BUDGET}"
+GROUNDED = f"--config ml4.yaml {BUDGET} --collect.scatter 0 --train.capacity 102400"
 # Do words matter? Half the budget, and a KL weight at which z may carry something.
-WORDS = "--config ml4.yaml --env.physics native --train.env_steps 600000 --kl.beta 0.001"
+WORDS = "--config ml4-plain.yaml --env.physics native --train.env_steps 600000 --kl.beta 0.001"
 
 EXPERIMENTS = {
     "cmrl-seed0": CMRL,
     "cmrl-seed1": f"{CMRL} --seed 1",
-    "grounded-seed0": f"--config ml4-grounded.yaml {BUDGET}",
-    "grounded-seed1": f"--config ml4-grounded.yaml {BUDGET} --seed 1",
+    "grounded-seed0": GROUNDED,
+    "grounded-seed1": f"{GROUNDED} --seed 1",
     "mtsac": "--config mtsac.yaml --env.physics native --train.env_steps 960000",
     "pearl": f"--config pearl.yaml {BUDGET}",
     "sac-drawer-close": f"{SINGLE} --tasks.train drawer-close",

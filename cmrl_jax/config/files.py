@@ -19,7 +19,7 @@ import yaml
 
 from cmrl_jax.commands import quoted
 from cmrl_jax.config.rules import validate
-from cmrl_jax.config.schema import Config, ConfigError, leaves
+from cmrl_jax.config.schema import Config, ConfigError, ModelConfig, leaves
 from cmrl_jax.config.yaml_tree import read_scalar, read_tree
 from cmrl_jax.places import PACKAGE
 from envs.command_line import brief, suggest
@@ -41,6 +41,19 @@ FREE_ON_RESUME = (
     "log.",
     "checkpoint.",
 )
+
+
+FORMER_DEFAULTS = {
+    "env.obs_mode": "metaworld",
+    "model.router_input": "z*obs",
+    "encoder.aux": "none",
+    "encoder.p_empty": 0.15,
+    "encoder.p_drop_goal": 0.2,
+    "kl.beta": 0.1,
+    "collect.scatter": 0,
+    "train.capacity": 102_400,
+}
+"""Defaults that are others today, of runs from before a key was added."""
 
 
 @functools.cache
@@ -93,7 +106,20 @@ def resolve(
 
 def from_dict(data: Mapping[str, Any], source: _Source | None = None) -> Config:
     """The config of plain YAML data, defaults where it is silent; types checked, rules not."""
-    return _section(Config, data, "", source or _Source())
+    return _section(Config, _as_of_its_time(data), "", source or _Source())
+
+
+def _as_of_its_time(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The data; a run's own record, which names whole sections, with what its defaults were."""
+    model = data.get("model")
+    if not isinstance(model, dict) or not set(_names(ModelConfig)) <= model.keys():
+        return data
+    data = dict(data)
+    for dotted, value in FORMER_DEFAULTS.items():
+        section, _, key = dotted.partition(".")
+        if isinstance(found := data.get(section), dict):
+            data[section] = {key: value} | found
+    return data
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -146,9 +172,10 @@ def check_resumable(saved: Mapping[str, Any], config: Config, run: Path) -> None
 
 
 def recorded(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """A run's config by dotted name. A key it lacks had its default, but for one: `canonical` runs
-    once took their origin from the reset observation, which need not show where the object is."""
-    record = {key: value for key, value in _flat(saved) if key not in RETIRED}
+    """A run's config by dotted name. A key it lacks had its default of that time; and `canonical`
+    runs once took their origin from the reset observation, which need not show where the object is.
+    """
+    record = FORMER_DEFAULTS | {key: x for key, x in _flat(saved) if key not in RETIRED}
     if record.get("env.obs_mode") == "canonical":
         record.setdefault("env.origin", "reset observation")
     return record

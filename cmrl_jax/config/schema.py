@@ -95,7 +95,7 @@ class EnvConfig:
         "episode_random", "fixture position at reset: drawn afresh, or from the 50 `train` goals"
     )
     obs_mode: Literal["metaworld", "canonical"] = doc(
-        "metaworld", "as Meta-World's, or canonical: relative to where the object began"
+        "canonical", "relative to where the object began, or metaworld: as Meta-World's"
     )
     # Recorded so that a policy is never shown observations from another origin than it learned by.
     origin: Literal["settled"] = doc(
@@ -122,7 +122,7 @@ class ModelConfig:
     )
     trunk_width: int = doc(128, "D: trunk and z-embedding width", above=0)
     gating_width: int = doc(64, "Hg: width of the router's gating layers", above=0)
-    router_input: Literal["z*obs", "z"] = doc("z*obs", "what the router sees")
+    router_input: Literal["z*obs", "z"] = doc("z", "what the router sees")
     trunk_input: Literal["obs", "obs_z"] = doc("obs", "what the trunk sees")
     router_temperature: float = doc(1.0, "softmax temperature of the routing", above=0)
     modular_actor: bool = doc(True, "soft-modular actor (false: MLP actor)")
@@ -143,16 +143,16 @@ class EncoderConfig:
     use_next_obs: bool = doc(True, "next observation in the context")
     goal_fusion: Literal["none", "concat", "factor", "both"] = doc("both", "how text enters q(z)")
     goal_width: int = doc(32, "Gp: width of the projected text vector", above=0)
-    p_drop_goal: float = doc(0.2, "probability that a task's text is hidden in an update", high=1)
+    p_drop_goal: float = doc(0.0, "probability that a task's text is hidden in an update", high=1)
     poe: Literal["pearl", "prior_tempered"] = doc("prior_tempered", "product of Gaussians")
     n_eff: int = doc(32, "prior_tempered: context size above which evidence is tempered", above=0)
     context_len: Literal["random", "fixed"] = doc("random", "context size: log-uniform or N_max")
     context_max: int = doc(64, "N_max: context transitions an update", above=0)
-    p_empty: float = doc(0.15, "probability of an empty context (needs a goal factor)", high=1)
+    p_empty: float = doc(0.5, "probability of an empty context (needs a goal factor)", high=1)
     context_reward_scale: float = doc(0.1, "reward scale inside the context")
     information_bottleneck: bool = doc(True, "false: z is the mean of the factors, no KL")
     aux: Literal["none", "recon", "contrastive"] = doc(
-        "none",
+        "contrastive",
         "z also learns recon: to predict reward and change of the observation over n_step steps; "
         "contrastive: which task's experience and which task's text belong together",
     )
@@ -161,7 +161,7 @@ class EncoderConfig:
 
 @dataclass(frozen=True)
 class KlConfig:
-    beta: float = doc(0.1, "weight of KL(q(z) || N(0, I))")
+    beta: float = doc(1.0e-3, "weight of KL(q(z) || N(0, I))")
     reduce: Literal["mean_tasks", "sum_tasks"] = doc("mean_tasks", "reduction over task rows")
     free_bits: float = doc(0.0, "nats per latent dimension that cost nothing")
 
@@ -207,7 +207,7 @@ class CollectConfig:
         low=1,
     )
     scatter: int = doc(
-        0,
+        40,
         "steps of one random action that an episode begins with, at most; 0: none",
         high=MOST_STEPS,
     )
@@ -222,7 +222,7 @@ class TrainConfig:
     env_steps: int = doc(1_000_000, "control steps of all lanes together; 0: no limit", high=10**12)
     minutes: float = doc(0.0, "wall-time limit of the whole run, final evaluation apart; 0: none")
     capacity: int = doc(
-        102_400,
+        340_000,
         "replay transitions per task; a multiple of the lanes of a task",
         above=0,
         high=LARGEST_RING,

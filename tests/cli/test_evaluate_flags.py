@@ -136,7 +136,7 @@ def test_eval_hands_over_its_flags(calls, here):
 
 def test_every_flag_changes_its_option(calls, here):
     """None is parsed and then left behind."""
-    make_run(here / "r", "ml4-grounded.yaml")
+    make_run(here / "r", "ml4.yaml")
     given = {
         "k": "3", "tasks": "window-open", "goals": "3", "goal_set": "fresh:3", "seed": "3",
         "horizon": "3", "physics": "native", "policy": "sampled", "z": "prior", "lanes": "3",

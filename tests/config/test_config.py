@@ -98,7 +98,7 @@ RULES = [
     ("model.mlp_hidden=", "model.mlp_hidden is empty"),
     ("encoder.hidden=", "encoder.hidden is empty"),
     ("eval.goals=51", "eval.goals is 51"),
-    ("sac.batch=102401", "sac.batch 102401 is over train.capacity 102400"),
+    ("sac.batch=340001", "sac.batch 340001 is over train.capacity 340000"),
     ("collect.lanes=97", "collect.lanes 97 is not divisible by the 3 training tasks"),
     ("collect.lanes=6", "the 2 lanes of a task cannot be split"),
     ("collect.group_frac=0.5,0.5,0.5", "sums to 1.5"),
@@ -113,28 +113,34 @@ RULES = [
     ("encoder.goal_fusion=none", "0.25 of the lanes to text with encoder.goal_fusion none"),
     ("encoder.goal_fusion=concat", "0.25 of the lanes to text with encoder.goal_fusion concat"),
     (
-        "encoder.goal_fusion=none collect.group_frac=0.5,0,0.5",
-        "encoder.p_empty is 0.15 with encoder.goal_fusion none",
+        "encoder.goal_fusion=none collect.group_frac=0.5,0,0.5 encoder.aux=none",
+        "encoder.p_empty is 0.5 with encoder.goal_fusion none",
     ),
     (
-        "encoder.goal_fusion=none collect.group_frac=0.5,0,0.5 encoder.aux=contrastive",
+        "encoder.goal_fusion=none collect.group_frac=0.5,0,0.5",
         "encoder.aux contrastive with encoder.goal_fusion none",
     ),
     (
-        "tasks.train=drawer-open encoder.aux=contrastive",
+        "tasks.train=drawer-open",
         "encoder.aux contrastive with one training task",
     ),
     (
         "model.conditioning=task_id tasks.test= encoder.aux=recon",
         "encoder.aux recon with model.conditioning task_id: no z to train",
     ),
-    ("model.conditioning=task_id", "['window-close'] with model.conditioning task_id"),
+    (
+        "model.conditioning=task_id encoder.aux=none",
+        "['window-close'] with model.conditioning task_id",
+    ),
     ("model.conditioning=none tasks.test=", "model.net soft with model.conditioning none"),
     ("model.modular_actor=false model.modular_critic=false", "neither modular_actor nor"),
     ("model.modules=1,2,64", "model.modules is [1, 2, 64]"),
     ("model.modules=2,1,64", "model.modules is [2, 1, 64]"),
     ("sac.variant=v model.critic=c51", "sac.variant v with model.critic c51"),
-    ("model.conditioning=task_id tasks.test=", "eval.k [0, 2] with model.conditioning task_id"),
+    (
+        "model.conditioning=task_id encoder.aux=none tasks.test=",
+        "eval.k [0, 2] with model.conditioning task_id",
+    ),
     ("eval.k=", "eval.k is empty"),
     ("eval.final_k=1,1", "eval.final_k [1, 1] repeats"),
     ("eval.goal_set=test", "eval.goal_set 'test' is no goal set"),
@@ -191,9 +197,23 @@ def test_ml4_names_every_key_that_matters():
     left_out = {name for name, _, _ in leaves(Config()) if "." in name} - named
     assert left_out == {
         "model.mlp_hidden", "model.critic_bins", "model.critic_v_max",
-        "model.critic_agg", "encoder.aux", "encoder.aux_weight",
+        "model.critic_agg", "encoder.aux_weight",
         "env.name", "env.origin",
     }  # fmt: skip
+
+
+def test_a_key_that_an_older_run_lacks_has_the_default_of_its_time(tmp_path):
+    """Also where the default is another one today; a file that is no run's record has today's."""
+    record = to_dict(load_config("ml4-plain.yaml"))
+    for section, key in (("collect", "scatter"), ("encoder", "aux"), ("env", "obs_mode")):
+        del record[section][key]
+    path = tmp_path / "x.yaml"
+    path.write_text(yaml.safe_dump(record))
+    plain = load_config("ml4-plain.yaml")
+    assert load_config(path) == plain and changed_fields(record, plain) == []
+    assert ("collect.scatter", 0, 40) in changed_fields(record, Config())
+    path.write_text("model: {net: mlp}\n")
+    assert load_config(path).collect.scatter == 40
 
 
 def test_keys_of_older_configurations_are_read_with_their_only_value(tmp_path):

@@ -180,7 +180,7 @@ def test_evaluation_does_not_depend_on_what_was_evaluated_before_or_beside(undis
 
 
 PRESETS = ("ml4", "pearl", "mtsac", "sac")
-SLOW = ("ml4-grounded", "cmrl-paper", "ml4-large")
+SLOW = ("cmrl-paper", "ml4-large")
 
 
 @pytest.mark.parametrize(
