@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from cmrl_jax.algorithms.cmrl.learner import TrainState
+from cmrl_jax.algorithms.base import RunState
+from cmrl_jax.algorithms.cmrl.search import BUDGET
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import Config, call_envs
 from cmrl_jax.evaluation.finetune import (
@@ -21,7 +23,9 @@ from cmrl_jax.evaluation.finetune import (
 )
 from cmrl_jax.evaluation.finetune_options import FinetuneOptions, check_run
 from cmrl_jax.evaluation.scores import fault_warning
-from cmrl_jax.evaluation.session import Session, prepare_jax
+from cmrl_jax.evaluation.session import Policy, Session, prepare_jax
+from cmrl_jax.evaluation.trials import evaluation_config
+from cmrl_jax.evaluation.winner import search_winner
 from cmrl_jax.storage.checkpoint import full_store, join_run, split_run
 from cmrl_jax.storage.versions import package_versions
 from cmrl_jax.text.goals import check_same_table, load_goals
@@ -44,7 +48,8 @@ def finetune_run(
     options = replace(options, physics=options.physics or config.env.physics)
     print(f"device: {prepare_jax(config)}", flush=True)
     session = Session(config)
-    trained, meta = load_learner(run, config, session)
+    state, meta = load_state(run, config, session)
+    trained = state.learner
     goals = load_goals(config.goals.table, (options.task,))
     cure = "put that table back, or adapt a run that was trained with this one"
     check_same_table(goals, meta["goals_sha256"], run, cure)
@@ -63,10 +68,17 @@ def finetune_run(
     )
     curves: Curves = {}
     for adapt, config_of_way in configs.items():
-        tuning = FineTuning(config_of_way, adapt, trained, text, options)
-        curves[adapt] = adaptation_curve(
-            tuning, options, placements, lambda n, score, adapt=adapt: _say(adapt, n, score)
-        )
+        keep = _keeper(adapt, curves.setdefault(adapt, {}))
+        winner = None
+        if adapt == "search":
+            winner = search_winner(
+                Session(evaluation_config(run, options.physics)),
+                policy_of(session, state, meta),
+                options,
+                keep,
+            )
+        tuning = FineTuning(config_of_way, adapt, trained, text, options, winner)
+        adaptation_curve(tuning, options, placements, keep, BUDGET if winner else None)
         for line in warnings_of(adapt, curves[adapt]):
             print(line, flush=True)
         if json_path is not None:  # after each way: a stopped command keeps what it has
@@ -80,12 +92,18 @@ def finetune_run(
     return 0
 
 
-def load_learner(run: Path, config: Config, session: Session) -> tuple[TrainState, dict[str, Any]]:
-    """The learner's state of a run's newest full checkpoint, and the checkpoint's record."""
+def load_state(run: Path, config: Config, session: Session) -> tuple[RunState, dict[str, Any]]:
+    """The state in a run's newest full checkpoint, and the checkpoint's record."""
     abstract = jax.eval_shape(session.algorithm.init, jax.random.key(0))
     with full_store(run, read_only=True) as store:
         trees, meta = store.restore(split_run(abstract), config, versions=package_versions())
-    return join_run(abstract, trees).learner, meta
+    return join_run(abstract, trees), meta
+
+
+def policy_of(session: Session, state: RunState, meta: dict[str, Any]) -> Policy:
+    """What a policy checkpoint of that state would hold."""
+    vectors = dict(zip(session.eval_tasks, session.goals.vectors[:, 0], strict=True))
+    return Policy(session.algorithm.policy_params(state), vectors, meta)
 
 
 def as_json(curves: Curves) -> dict[str, Any]:
@@ -120,6 +138,12 @@ def warnings_of(adapt: str, curve: dict[int, Score]) -> list[str]:
     return lines
 
 
-def _say(adapt: str, episodes: int, score: Score) -> None:
-    figures = f"{score.success_any:.2f} / {score.success_last:.2f}  return {score.returns:.0f}"
-    print(f"{adapt:<10} {episodes:>5}  {figures}", flush=True)
+def _keeper(adapt: str, curve: dict[int, Score]) -> Callable[[int, Score], None]:
+    """Takes each read-out of a way in, and prints it."""
+
+    def keep(episodes: int, score: Score) -> None:
+        curve[episodes] = score
+        figures = f"{score.success_any:.2f} / {score.success_last:.2f}  return {score.returns:.0f}"
+        print(f"{adapt:<10} {episodes:>5}  {figures}", flush=True)
+
+    return keep

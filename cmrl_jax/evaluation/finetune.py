@@ -6,7 +6,8 @@ ways that learn have made equally many. At the read-outs the policy is scored on
 from the belief over all own transitions, no further adaptation. Normalisers stay those of training,
 and rewards are divided by the mean of the training tasks' denominators;
 `scratch` is SAC that knows nothing: its first episode has random actions, and it keeps statistics
-of its own.
+of its own. `search` spends its first episodes as `eval --adapt search` does, without gradients, and
+goes on from the winner: its z is a parameter, and the task is seen in its view.
 """
 
 from __future__ import annotations
@@ -28,13 +29,14 @@ from cmrl_jax.config.files import load_config
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config
 from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
-from cmrl_jax.evaluation.finetune_options import FinetuneOptions
+from cmrl_jax.evaluation.finetune_options import FREE_Z, FinetuneOptions
 from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.nn import normalizers
 from cmrl_jax.nn.context import Belief, ContextInference, init_belief, make_context_inference
 from cmrl_jax.nn.distributions import Gaussian
 from cmrl_jax.nn.optimizers import init_adam
 from cmrl_jax.registry import make_environment
+from envs.turned import TurnedEnv
 
 ROUTER_PARTS = ("embedding", "gating", "routing")  # names in networks.SoftModularNet begin so
 FREE_LATENT = "z"
@@ -65,6 +67,14 @@ class Score(NamedTuple):
     skipped: int = 0
 
 
+class Winner(NamedTuple):
+    """What a search has found: z (latent,), and the view's matrices of observation and action."""
+
+    z: np.ndarray
+    of_obs: np.ndarray
+    of_action: np.ndarray
+
+
 def finetune_config(
     config: Config, task: str, adapt: str, episodes: int, updates: int, denominator: float
 ) -> Config:
@@ -91,7 +101,7 @@ def finetune_config(
     encoder = config.encoder
     if encoder.aux == "contrastive":
         encoder = replace(encoder, aux="none")  # one task alone has nothing to be told from
-    if adapt == "z":
+    if adapt in FREE_Z:
         # The latent stands alone: no encoder, and no decoder that its parameters would hold.
         encoder = replace(encoder, information_bottleneck=False, aux="none")
     collect = replace(
@@ -100,6 +110,7 @@ def finetune_config(
         chunk=chunk,
         group_frac=(0.0, 0.0, 1.0),
         updates_per_vector_step=updates,
+        scatter=0,
         initial="random" if adapt == "scratch" else "prior",
         context_source="recent",
         context_episodes=episodes,
@@ -142,7 +153,7 @@ def free_latent(latent_dim: int) -> ContextInference:
 
 def is_adapted(adapt: str, network: str, path: tuple[Any, ...]) -> bool:
     """Whether gradient steps change a leaf of one of `_NETWORKS`."""
-    if adapt in ("all", "scratch"):
+    if adapt in ("all", "search", "scratch"):
         return True
     if adapt == "z":
         return network == "encoder_params"
@@ -186,6 +197,7 @@ def start_state(
     fresh: TrainState,
     trained: TrainState,
     text: jax.Array,
+    z: jax.Array | None = None,
 ) -> TrainState:
     """A learner's first state, with what was trained in its place.
 
@@ -193,17 +205,19 @@ def start_state(
         fresh: a first state of `learner`.
         trained: the run's state, of any number of tasks.
         text: text vector of the new task (G,).
+        z: where a free latent begins (latent,); None: where the sentence alone puts it, or at the
+            prior's mean.
     """
     if adapt == "scratch":
         return jax.tree.map(jnp.copy, fresh)  # every leaf a buffer of its own, to be donated
     kept = {name: getattr(trained, name) for name in _NETWORKS}
-    if adapt == "z":
-        # It begins where the sentence alone puts it, or at the prior's mean.
-        bottleneck = replace(config.encoder, information_bottleneck=True)
-        original = make_context_inference(replace(config, encoder=bottleneck), learner.networks)
-        belief = init_belief((), original.latent_dim)
-        posterior = original.posterior_of_belief(trained.encoder_params, belief, text, jnp.ones(()))
-        kept["encoder_params"] = {FREE_LATENT: posterior.mean}
+    if adapt in FREE_Z:
+        if z is None:
+            bottleneck = replace(config.encoder, information_bottleneck=True)
+            original = make_context_inference(replace(config, encoder=bottleneck), learner.networks)
+            belief, told = init_belief((), original.latent_dim), jnp.ones(())
+            z = original.posterior_of_belief(trained.encoder_params, belief, text, told).mean
+        kept["encoder_params"] = {FREE_LATENT: z}
         fresh = replace(fresh, encoder_opt_state=init_adam(kept["encoder_params"]))
     state = replace(
         fresh,
@@ -221,6 +235,7 @@ class FineTuning:
         config: of `finetune_config`, for the way and its task.
         adapt: one of `finetune_options.ADAPT`.
         text: text vector of the task (G,).
+        winner: of the search that came before, for the way `search`.
     """
 
     def __init__(
@@ -230,13 +245,16 @@ class FineTuning:
         trained: TrainState,
         text: np.ndarray,
         options: FinetuneOptions,
+        winner: Winner | None = None,
     ):
         self.config = config
         physics = options.physics or self.config.env.physics
         self.env = make_environment(replace(self.config.env, physics=physics))
+        if winner is not None:
+            self.env = TurnedEnv(self.env, winner.of_obs, winner.of_action)
         goals = jnp.asarray(text)[None, None]  # (task, paraphrase, G)
         inference = None
-        if adapt == "z":
+        if adapt in FREE_Z:
             inference = free_latent(self.config.encoder.latent_dim)
         sizes = self.env.observation_size, self.env.action_size
         self.learner = RestrictedLearner(adapt, self.config, goals, *sizes, inference=inference)
@@ -259,7 +277,7 @@ class FineTuning:
         init = jit_once(lambda key: init_run(self.config, self.env, learner, key))
         start = jit_once(
             lambda fresh, trained, text: start_state(
-                adapt, self.config, learner, fresh, trained, text
+                adapt, self.config, learner, fresh, trained, text, winner.z if winner else None
             )
         )
         self.own_belief = jax.jit(
@@ -326,16 +344,19 @@ def adaptation_curve(
     options: FinetuneOptions,
     placements: np.ndarray,
     say: Callable[[int, Score], None],
-) -> dict[int, Score]:
-    """Scores at the read-outs, by episodes of own experience."""
-    curve = {}
-    for episode in range(options.episodes + 1):
-        if episode:
-            tuning.gather()
+    searched: int | None = None,
+) -> None:
+    """Gathers and learns, episode after episode; says the score at each read-out.
+
+    Args:
+        searched: own episodes that a search has spent and has said the scores of.
+    """
+    if searched is None and 0 in options.read_outs:
+        say(0, tuning.read_out(placements, options.seed))
+    for episode in range(1 + (searched or 0), options.episodes + 1):
+        tuning.gather()
         if episode in options.read_outs:
-            curve[episode] = tuning.read_out(placements, options.seed)
-            say(episode, curve[episode])
-    return curve
+            say(episode, tuning.read_out(placements, options.seed))
 
 
 def training_denominator(config: Config, state: TrainState) -> float:

@@ -8,8 +8,10 @@ from cmrl_jax.config.schema import Config, ConfigError, require
 from cmrl_jax.registry import environment
 from envs.goal_names import GOALS
 
-# What gradient steps may change; `posterior`: nothing, `scratch`: SAC that begins from nothing.
-ADAPT = ("posterior", "z", "router", "all", "scratch")
+# What gradient steps may change; `posterior`: nothing, `scratch`: SAC that begins from nothing,
+# `search`: all and z, after a search has found where to begin.
+ADAPT = ("posterior", "z", "router", "all", "search", "scratch")
+FREE_Z = ("z", "search")  # z is a parameter of its own, no encoder's output
 
 
 READ_OUTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -63,6 +65,7 @@ def check_run(config: Config, options: FinetuneOptions) -> None:
     # another task.
     has = {"z": config.model.conditioning == "z", "router": config.model.net == "soft"}
     needs = {"posterior": ("z",), "z": ("z",), "router": ("z", "router"), "all": ("z",)}
+    needs["search"] = ("z",)
     lacks = {way: [part for part in needs.get(way, ()) if not has[part]] for way in ADAPT}
     if missing := [way for way in options.adapt if lacks[way]]:
         left = [way for way in options.adapt if not lacks[way]]

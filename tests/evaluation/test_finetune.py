@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from learner_fixtures import GOALS, TASKS, VARIANTS, build, filled_ring, spread, tiny_config
 
+from cmrl_jax.algorithms.cmrl.agent import PolicyParams
 from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.common.replay import ContextBatch
 from cmrl_jax.cli import finetune as finetune_cli
@@ -18,9 +19,11 @@ from cmrl_jax.config.files import load_config
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.evaluation import finetune
+from cmrl_jax.evaluation.evaluator import Evaluator, Trial
 from cmrl_jax.evaluation.finetune import (
     FineTuning,
     RestrictedLearner,
+    Winner,
     adaptation_curve,
     finetune_config,
     free_latent,
@@ -302,7 +305,8 @@ def restored(undisturbed_modular):
     """The run's configuration, its learner's state, a text vector and two placements."""
     config = load_config(str(undisturbed_modular / "config.yaml"))
     session = Session(config)
-    trained, _ = finetune_cli.load_learner(undisturbed_modular, config, session)
+    state, _ = finetune_cli.load_state(undisturbed_modular, config, session)
+    trained = state.learner
     text = load_goals(config.goals.table, ("window-close",)).vectors[0, 0]
     placements = session.placements("heldout", 2, ("window-close",))[0]
     return config, trained, text, np.asarray(placements, np.float32)
@@ -322,8 +326,8 @@ def test_own_episodes_change_what_is_adapted(restored, adapt):
         states.append(jax.device_get(tuning.run.learner))  # a copy: the run's own is donated
         assert np.isfinite(score).all()
 
-    curve = adaptation_curve(tuning, options, placements, say)
-    assert list(curve) == [0, 1, 2] and tuning.run.replay.size == 2 * config.env.horizon
+    adaptation_curve(tuning, options, placements, say)
+    assert tuning.run.replay.size == 2 * config.env.horizon
     assert [state.gradient_steps for state in states] == [0, 50, 100]
     for before, after in zip(states, states[1:], strict=False):
         moved = changed(before, after)
@@ -332,6 +336,36 @@ def test_own_episodes_change_what_is_adapted(restored, adapt):
         else:
             networks = NETWORKS if adapt == "all" else NETWORKS[:3]
             assert {path.split("/")[0] for path in moved} == set(networks)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("view", [0, 5])  # as it is, and a quarter turn
+def test_after_a_search_it_begins_where_the_winner_plays(restored, view):
+    """Before any gradient its read-out is the arm's own score in the evaluation of every arm."""
+    config, trained, text, placements = restored
+    session = Session(config)
+    learner = session.algorithm.parts
+    shape = learner.num_tasks, learner.inference.latent_dim
+    task_z = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    params = PolicyParams(trained.actor_params, trained.encoder_params, trained.obs_stats, task_z)
+    agent = session.agent_of("arms")
+    arm = 2 * agent.views + view
+    shown = np.broadcast_to(text, (1, 1, len(placements), len(text)))
+    trial = Trial(("window-close",), placements[None], shown)
+    evaluator = Evaluator(config, session.env, agent, len(placements))
+    wanted = evaluator.run([params], trial, (arm,), seed=0)[arm]
+    of_obs, of_action = (matrices[view] for matrices in session.env.symmetries)
+    options = FinetuneOptions("window-close", episodes=21)
+    tuned = finetune_config(config, options.task, "search", options.episodes, 1, 1.0)
+    winner = Winner(task_z[1], of_obs, of_action)
+    tuning = FineTuning(tuned, "search", trained, text, options, winner)
+    found = tuning.read_out(placements, seed=0)
+    np.testing.assert_allclose(found.returns, wanted.returns.mean(), rtol=1e-4)
+    said = []
+    adaptation_curve(tuning, options, placements, lambda n, _: said.append(n), searched=20)
+    assert said == [21]
+    moved = {path.split("/")[0] for path in changed(trained, tuning.run.learner)}
+    assert set(NETWORKS[:3]) <= moved
 
 
 @pytest.mark.slow
