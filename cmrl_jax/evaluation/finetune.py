@@ -70,7 +70,7 @@ class Score(NamedTuple):
 class Winner(NamedTuple):
     """What a search has found: z (latent,), and the view's matrices of observation and action."""
 
-    z: np.ndarray
+    z: jax.Array
     of_obs: np.ndarray
     of_action: np.ndarray
 

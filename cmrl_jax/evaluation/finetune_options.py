@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from cmrl_jax.config.schema import Config, ConfigError, require
 from cmrl_jax.registry import environment
@@ -38,7 +39,7 @@ class FinetuneOptions:
     goals: int = GOALS
     goal_set: str = "heldout"
     seed: int = 0
-    physics: str | None = None
+    physics: Literal["mjx", "native"] | None = None
 
     @property
     def read_outs(self) -> tuple[int, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
+import jax.numpy as jnp
 
 from cmrl_jax.algorithms.cmrl.search import BUDGET, SearchAgent
 from cmrl_jax.evaluation.finetune import Score, Winner, mean_score
@@ -51,4 +51,4 @@ def search_winner(
             last = played.after  # every lane's is the task's one search
     of_obs, of_action = agent.symmetries
     view = int(last.arm[0, 0]) % agent.views
-    return Winner(np.asarray(last.z[0, 0]), of_obs[view], of_action[view])
+    return Winner(jnp.asarray(last.z[0, 0]), of_obs[view], of_action[view])

@@ -349,7 +349,7 @@ def test_after_a_search_it_begins_where_the_winner_plays(restored, view):
     task_z = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     params = PolicyParams(trained.actor_params, trained.encoder_params, trained.obs_stats, task_z)
     agent = session.agent_of("arms")
-    arm = 2 * agent.views + view
+    arm = 2 * len(session.env.symmetries[0]) + view
     shown = np.broadcast_to(text, (1, 1, len(placements), len(text)))
     trial = Trial(("window-close",), placements[None], shown)
     evaluator = Evaluator(config, session.env, agent, len(placements))
@@ -357,7 +357,7 @@ def test_after_a_search_it_begins_where_the_winner_plays(restored, view):
     of_obs, of_action = (matrices[view] for matrices in session.env.symmetries)
     options = FinetuneOptions("window-close", episodes=21)
     tuned = finetune_config(config, options.task, "search", options.episodes, 1, 1.0)
-    winner = Winner(task_z[1], of_obs, of_action)
+    winner = Winner(jnp.asarray(task_z[1]), of_obs, of_action)
     tuning = FineTuning(tuned, "search", trained, text, options, winner)
     found = tuning.read_out(placements, seed=0)
     np.testing.assert_allclose(found.returns, wanted.returns.mean(), rtol=1e-4)
