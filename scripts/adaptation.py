@@ -11,6 +11,7 @@ prints every command. Names after the word choose among the runs.
 
 from __future__ import annotations
 
+import csv
 import itertools
 import json
 import shlex
@@ -20,10 +21,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from cmrl_jax.config.schema import ConfigError  # noqa: E402
+from cmrl_jax.evaluation.statistics import seeds_interval  # noqa: E402
 from cmrl_jax.storage.documents import read_json  # noqa: E402
 from cmrl_jax.storage.run_files import EVALUATION  # noqa: E402
 from scripts.experiments import refused  # noqa: E402
@@ -32,6 +36,7 @@ RUNS, RESULTS = Path("runs/adaptation"), Path("results/adaptation")
 POLICIES, SCORES = RESULTS / "policies", RESULTS / "scores"
 TASKS = ("drawer-open", "drawer-close", "window-open", "window-close")
 SEEDS = range(5)
+FIGURES = ("success_any", "success_last")
 K = (0, 1, 2, 5, 10, 20)
 
 # What is trained in every fold. PEARL sees what the others see and begins as they do, so that only
@@ -49,7 +54,7 @@ EVALUATIONS = {
     "search-goal": f"--adapt search {_K}",
     "posterior-task": f"{_K} {_TASK}",
     "posterior-goal": f"{_K}",
-    "arms": "--adapt arms --k " + ",".join(map(str, range(16))),
+    "arms": "--adapt arms --k " + ",".join(map(str, range(32))),  # four z in eight views
     "text-shuffled": "--k 0 --text-control shuffled",
     "text-zero": "--k 0 --text-control zero",
     "trained": "--k 0",
@@ -127,12 +132,31 @@ def score(names: list[str]) -> int:
                 continue
             out.parent.mkdir(parents=True, exist_ok=True)
             print(f"== {name} {evaluation}", flush=True)
-            command = [sys.executable, *score_command(name, evaluation)]
+            cells = out.with_suffix(".csv")
+            cells.unlink(missing_ok=True)  # of a command that was stopped
+            command = [sys.executable, *score_command(name, evaluation), "--csv", str(cells)]
             if code := subprocess.run(command, cwd=ROOT).returncode:
                 return code
+            keep_goals(cells, out)
     return 0
 
 
+def keep_goals(cells: Path, out: Path) -> None:
+    """Adds each goal's success, mean over draws, to an evaluation's JSON; removes the cells."""
+    by_goal: dict[tuple[str, str, int], list[dict[str, str]]] = {}
+    with cells.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            by_goal.setdefault((row["task"], row["k"], int(row["goal"])), []).append(row)
+    found = json.loads(out.read_text(encoding="utf-8"))
+    for (task, k, _), rows in sorted(by_goal.items()):
+        goals = found["tasks"][task][k].setdefault("goals", {x: [] for x in FIGURES})
+        for figure in FIGURES:
+            goals[figure].append(round(sum(float(r[figure]) for r in rows) / len(rows), 4))
+    out.write_text(json.dumps(found) + "\n", encoding="utf-8")
+    cells.unlink()
+
+
+CURVES = ("cmrl", "cmrl-posterior", "pearl", "pearl-search", "untrained-search", "random-arm")
 METHODS = {  # of (kind, adapt)
     ("cmrl", "search"): "cmrl",
     ("cmrl", "posterior"): "cmrl-posterior",
@@ -149,7 +173,7 @@ def rows_of(name: str) -> list[dict[str, Any]]:
 
     def add(method: str, protocol: str, k: int, figures: dict[str, Any]) -> None:
         row = {"fold": fold, "method": method, "protocol": protocol, "seed": seed, "k": k}
-        rows.append(row | {x: figures[x] for x in ("success_any", "success_last")})
+        rows.append(row | {x: figures[x] for x in FIGURES})
 
     for adapt, protocol in itertools.product(("search", "posterior"), ("task", "goal")):
         for k, figures in figures_of(name, f"{adapt}-{protocol}", fold).items():
@@ -180,15 +204,102 @@ def figures_of(name: str, evaluation: str, task: str) -> dict[int, dict[str, Any
 
 
 def mean(arms: list[dict[str, Any]]) -> dict[str, float]:
-    return {x: sum(f[x] for f in arms) / len(arms) for x in ("success_any", "success_last")}
+    return {x: sum(f[x] for f in arms) / len(arms) for x in FIGURES}
 
 
 def table(names: list[str]) -> int:
-    """Writes folds.json from the evaluations that are there."""
+    """Writes folds.json and curves.png from the evaluations that are there; prints the tables."""
     rows = [row for name in names for row in rows_of(name)]
-    (RESULTS / "folds.json").write_text(json.dumps({"rows": rows}, indent=0) + "\n")
+    lines = ",\n".join(json.dumps(row) for row in rows)
+    (RESULTS / "folds.json").write_text(f'{{"rows": [\n{lines}\n]}}\n', encoding="utf-8")
     print(f"{RESULTS / 'folds.json'}: {len(rows)} rows")
+    for protocol in ("task", "goal"):
+        print("", *markdown(rows, protocol), sep="\n")
+    print("", *intervals(names), sep="\n")
+    print("", *trained_tasks(names), sep="\n")
+    draw_curves(rows, RESULTS / "curves.png")
     return 0
+
+
+def markdown(rows: list[dict[str, Any]], protocol: str) -> list[str]:
+    """Any / last step at k = 20 by fold: mean over seeds, and the worst seed's any step."""
+    head = [f"{protocol} protocol, k = {K[-1]}", *TASKS]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    by_method: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for row in rows:
+        last = K[-1] if not row["method"].startswith("cmrl-text") else 0
+        if row["protocol"] == protocol and row["k"] == last:
+            by_method.setdefault(row["method"], {}).setdefault(row["fold"], []).append(row)
+    for method, folds in by_method.items():
+        cells = []
+        for fold in TASKS:
+            found = folds.get(fold, [])
+            if not found:
+                cells.append("")
+                continue
+            means = [sum(r[x] for r in found) / len(found) for x in FIGURES]
+            worst = min(r["success_any"] for r in found)
+            cells.append(f"{means[0]:.2f} / {means[1]:.2f}, worst {worst:.2f} of {len(found)}")
+        lines.append("| " + " | ".join([method, *cells]) + " |")
+    return lines
+
+
+def intervals(names: list[str]) -> list[str]:
+    """IQM over seeds with its interval over seeds and goals, the search by the task protocol."""
+    lines = ["| fold | k | any step, IQM | last step, IQM |", "| --- | --- | --- | --- |"]
+    for fold, k in itertools.product(TASKS, K):
+        own = [n for n in names if parts(n)[:2] == ("cmrl", fold)]
+        found = [figures_of(n, "search-task", fold).get(k) for n in own]
+        goals = [f["goals"] for f in found if f]
+        if not goals:
+            continue
+        cells = []
+        for figure in FIGURES:
+            middle, (low, high) = seeds_interval([np.array([g[figure] for g in goals])])
+            cells.append(f"{middle:.2f} [{low:.2f}, {high:.2f}]")
+        lines.append(f"| {fold} | {k} | {cells[0]} | {cells[1]} |")
+    return lines
+
+
+def trained_tasks(names: list[str]) -> list[str]:
+    """The worst training task of each run, any step: own sentence, and after a search."""
+    lines = ["| run | own sentence | search, k = 20 |", "| --- | --- | --- |"]
+    for name in (n for n in names if parts(n)[0] == "cmrl"):
+        trained = [task for task in TASKS if task != parts(name)[1]]
+        cells = []
+        for evaluation, k in (("trained", 0), ("trained-search", 20)):
+            found = [figures_of(name, evaluation, task).get(k) for task in trained]
+            cells.append(f"{min(f['success_any'] for f in found if f):.2f}" if all(found) else "")
+        if any(cells):
+            lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
+    return lines
+
+
+def draw_curves(rows: list[dict[str, Any]], path: Path) -> None:
+    """Success against own episodes, a panel a fold: mean over seeds, and every seed of CMRL."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(14, 3.6), layout="constrained")
+    axes = figure.subplots(1, len(TASKS), sharey=True)
+    for axis, fold in zip(axes, TASKS, strict=True):
+        for method, color in zip(CURVES, ("C0", "C1", "C2", "C3", "C4", "C7"), strict=True):
+            found = [
+                r for r in rows if (r["fold"], r["method"], r["protocol"]) == (fold, method, "task")
+            ]
+            for seed in {r["seed"] for r in found} if method == "cmrl" else ():
+                own = [r for r in found if r["seed"] == seed]
+                axis.plot([r["k"] for r in own], [r["success_any"] for r in own], color, alpha=0.2)
+            ks = sorted({r["k"] for r in found})
+            for name, style in (("success_any", "-"), ("success_last", ":")):
+                by_k = [[r[name] for r in found if r["k"] == k] for k in ks]
+                means = [sum(x) / len(x) for x in by_k]
+                label = method if name == "success_any" else None
+                axis.plot(ks, means, style, color=color, label=label)
+        axis.set(title=f"held out: {fold}", xlabel="own episodes", ylim=(-0.03, 1.03))
+    axes[0].set_ylabel("success (any step; dotted: last)")
+    axes[0].legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+    print(path)
 
 
 STEPS = {"train": train, "score": score, "table": table}
