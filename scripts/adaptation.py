@@ -42,9 +42,9 @@ K = (0, 1, 2, 5, 10, 20)
 # What is trained in every fold. PEARL sees what the others see and begins as they do, so that only
 # the method differs; the networks of `untrained` are as initialised: iteration 0 learns nothing.
 KINDS = {
-    "cmrl": "--config ml4.yaml --train.env_steps 1000000",
+    "cmrl": "--config ml4.yaml",
     "pearl": "--config pearl.yaml --env.obs_mode canonical --collect.scatter 40"
-    " --train.capacity 340000 --train.env_steps 1000000",
+    " --train.capacity 340000 --train.env_steps 600000",
     "untrained": "--config ml4.yaml --train.env_steps 19200",
 }
 _K = f"--k {','.join(map(str, K))}"

@@ -51,6 +51,7 @@ FORMER_DEFAULTS = {
     "encoder.p_drop_goal": 0.2,
     "kl.beta": 0.1,
     "collect.scatter": 0,
+    "train.env_steps": 1_000_000,
     "train.capacity": 102_400,
 }
 """Defaults that are others today, of runs from before a key was added."""
