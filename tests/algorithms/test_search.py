@@ -160,6 +160,39 @@ def test_arms_in_turn_are_played_whatever_they_earn(made, params):
         assert (trial.play() == arm).all()
 
 
+def test_what_moves_late_beats_what_waits(made, params):
+    """Arm 1 earns 5 throughout; arm 6 nothing, then 9: less in all, more at its best."""
+
+    def value(lane, arm):
+        reward = np.zeros(STEPS)
+        if arm == 1:
+            reward[:] = 5.0
+        if arm == 6:
+            reward[STEPS // 2 :] = 9.0
+        return reward
+
+    trial = Trial(made, params, value)
+    for _ in range(ARMS + 1):  # what is played last is credited when the next begins
+        trial.play()
+    assert (trial.play(exploit=True) == 6).all()
+    waits, moves = ((sum(value(0, a)), max(value(0, a))) for a in (1, 6))
+    horizon = made.learner.config.env.horizon
+    wanted = [earned + horizon * peak for earned, peak in (waits, moves)]
+    found = trial.memory.credit[0, [1, 6]] / trial.memory.plays[0, [1, 6]]
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+
+
+def test_a_window_with_a_masked_step_is_no_peak(made, params):
+    """Rewards of -3, then -1; of the second window one step is masked in lane 1, all in lane 2."""
+    agent = agent_of(made)
+    reward = np.full((LANES, STEPS + 2), -3.0, np.float32)
+    reward[:, 5:10] = -1.0
+    mask = np.ones_like(reward)
+    mask[1, 7], mask[2] = 0, 0
+    after = agent.observe(params, agent.init(TOLD), transitions(reward), jnp.asarray(mask))
+    np.testing.assert_array_equal(after.peak, [-1, -3, -np.inf])
+
+
 def test_a_step_that_is_masked_earns_nothing(made, params):
     agent = agent_of(made)
     memory = replace(agent.init(TOLD), learns=jnp.ones(LANES))

@@ -5,8 +5,9 @@ own sentence (the prior's mean without text) or that of a training task, acting 
 is seen mirrored or turned. Exploring episodes try the task's own z in every view, then the training
 tasks' in the best of those, then the best arms again by successive halving (Karnin et al. 2013:
 sequential halving). A counted episode takes the best arm so far and teaches nothing. Arms are
-judged by their returns alone. Everything is data in the compiled episode, so one program plays any
-budget.
+judged by rewards alone: the return, and as much again for the best few steps, since waiting at an
+object can pay as much as moving it late. Everything is data in the compiled episode, so one program
+plays any budget.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.nn.context import init_belief
 
 BUDGET = 20  # exploring episodes that the rounds are laid out for
+PEAK_STEPS = 5  # consecutive steps whose mean reward is an episode's peak
 
 
 @struct.dataclass
@@ -36,11 +38,13 @@ class SearchMemory:
         text: (lane, G).
         text_mask: (lane,).
         plays: (lane, arm) float32, exploring episodes of each arm.
-        credit: (lane, arm) sum of their returns.
+        credit: (lane, arm) sum of their scores.
         order: (lane, arm) int32, arms in the order in which the round at hand tries them.
         arm: (lane,) int32, of the episode at hand.
         learns: (lane,) float32, 1 where the episode at hand is to be credited.
         returns: (lane,) of the episode at hand so far.
+        peak: (lane,) largest mean reward of `PEAK_STEPS` steps of it so far; windows lie end to end
+            from each observed stretch's first step.
         z: (lane, latent), of the episode at hand.
     """
 
@@ -52,6 +56,7 @@ class SearchMemory:
     arm: jax.Array
     learns: jax.Array
     returns: jax.Array
+    peak: jax.Array
     z: jax.Array
 
 
@@ -122,6 +127,7 @@ class SearchAgent:
             arm=jnp.zeros(lead, jnp.int32),
             learns=jnp.zeros(lead),
             returns=jnp.zeros(lead),
+            peak=jnp.full(lead, -jnp.inf),
             z=jnp.zeros((*lead, inference.latent_dim)),
         )
 
@@ -139,7 +145,8 @@ class SearchAgent:
         exploit: jax.Array,
     ) -> SearchMemory:
         del keys  # nothing is drawn
-        memory, source = _credited(memory), _credited(source)
+        horizon = self.learner.config.env.horizon
+        memory, source = _credited(memory, horizon), _credited(source, horizon)
         order = self._order(source)
         tried = self._chosen(source, order, exploit)
         z = self._z_of(params, source, tried // self.views)
@@ -172,8 +179,17 @@ class SearchAgent:
     def observe(
         self, params: PolicyParams, memory: SearchMemory, transitions: Transition, mask: jax.Array
     ) -> SearchMemory:
-        earned = jnp.sum(transitions.reward, -1, where=mask > 0)
-        return replace(memory, returns=memory.returns + earned)
+        reward, counts = transitions.reward, mask > 0
+        steps = min(PEAK_STEPS, self.chunk)
+        short = -reward.shape[1] % steps  # steps that the last window lacks, and that spoil it
+        window = lambda x: jnp.pad(x, ((0, 0), (0, short))).reshape(len(x), -1, steps)
+        whole = jnp.all(window(counts), -1)
+        peak = jnp.max(jnp.where(whole, jnp.mean(window(reward), -1), -jnp.inf), -1)
+        return replace(
+            memory,
+            returns=memory.returns + jnp.sum(reward, -1, where=counts),
+            peak=jnp.maximum(memory.peak, peak),
+        )
 
     def describe(self, memory: SearchMemory) -> list[str]:
         """The arm of each lane's episode: whose z, and in which view but the identity."""
@@ -236,20 +252,24 @@ class ArmsInTurn(SearchAgent):
         return jnp.sum(memory.plays, -1).astype(jnp.int32) % self.arms
 
 
-def _credited(memory: SearchMemory) -> SearchMemory:
+def _credited(memory: SearchMemory, horizon: int) -> SearchMemory:
     """The memory with the episode that has ended credited to its arm, if it was to be."""
+    # Of no whole window the episode's mean: it was shorter than one.
+    peak = jnp.where(jnp.isfinite(memory.peak), memory.peak, memory.returns / horizon)
+    score = memory.returns + horizon * peak
     played = jax.nn.one_hot(memory.arm, memory.plays.shape[-1]) * memory.learns[..., None]
     return replace(
         memory,
         plays=memory.plays + played,
-        credit=memory.credit + played * memory.returns[..., None],
+        credit=memory.credit + played * score[..., None],
         learns=jnp.zeros_like(memory.learns),
         returns=jnp.zeros_like(memory.returns),
+        peak=jnp.full_like(memory.peak, -jnp.inf),
     )
 
 
 def _means(memory: SearchMemory) -> jax.Array:
-    """Mean return of each arm (lane, arm); -inf for one that was never tried."""
+    """Mean score of each arm (lane, arm); -inf for one that was never tried."""
     mean = memory.credit / jnp.maximum(memory.plays, 1.0)
     return jnp.where(memory.plays > 0, mean, -jnp.inf)
 
