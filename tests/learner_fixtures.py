@@ -21,8 +21,11 @@ def tiny_config(**sections):
     """Default options at tiny sizes; `sections` override fields, as model={"net": "mlp"}."""
     sizes = {
         "model": {"mlp_hidden": (8,), "modules": (2, 2, 4), "trunk_width": 8, "gating_width": 4,
+                  "router_input": "z*obs",
                   "critic_bins": 5, "critic_v_max": 2.0},
-        "encoder": {"hidden": (8,), "latent_dim": LATENT, "goal_width": 3, "context_max": CONTEXT},
+        "encoder": {"hidden": (8,), "latent_dim": LATENT, "goal_width": 3, "context_max": CONTEXT,
+                    "aux": "none", "p_empty": 0.15, "p_drop_goal": 0.2},
+        "kl": {"beta": 0.1},
         "sac": {"batch": BATCH, "normalize_obs": False, "reward_norm": "none"},
         "collect": {"lanes": TASKS * LANES},
     }  # fmt: skip

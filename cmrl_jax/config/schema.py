@@ -208,7 +208,7 @@ class CollectConfig:
     )
     scatter: int = doc(
         40,
-        "steps of one random action that an episode begins with, at most; 0: none",
+        "steps of one random action that an episode begins with, at most (and half of it); 0: none",
         high=MOST_STEPS,
     )
     initial: Literal["random", "prior"] = doc("random", "actions of iteration 0")

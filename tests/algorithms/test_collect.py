@@ -50,6 +50,11 @@ def test_an_episode_begins_with_up_to_so_many_steps_of_one_random_action():
     assert push.min() < -0.95 and push.max() > 0.95
 
 
+def test_half_of_an_episode_is_left_to_the_policy():
+    _, where = imposed(10_000, is_first=False)
+    assert 90 < where.sum(0).max() <= 100  # of 200 steps
+
+
 def test_only_iteration_0_is_uniform_throughout():
     actions, where = imposed(0, is_first=True)
     assert where.all() and len(np.unique(actions)) > 0.99 * actions.size

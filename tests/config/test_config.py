@@ -92,7 +92,6 @@ RULES = [
     ("sac.gamma=0.0", "sac.gamma is 0.0"),
     ("sac.n_step=0", "sac.n_step is 0"),
     ("sac.n_step=201", "sac.n_step 201 is longer than env.horizon 200"),
-    ("collect.scatter=200", "collect.scatter 200 leaves nothing of env.horizon 200"),
     ("encoder.p_empty=2", "encoder.p_empty is 2"),
     ("model.mlp_hidden=128,0", "model.mlp_hidden is 0"),
     ("model.mlp_hidden=", "model.mlp_hidden is empty"),

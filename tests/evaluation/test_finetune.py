@@ -166,7 +166,7 @@ def test_mistakes_are_refused(undisturbed, refused, words, cause, cure):
 def test_a_network_without_router_has_none_to_adapt():
     config = tiny_config(**VARIANTS["pearl"])
     options = FinetuneOptions("window-close", adapt=ADAPT)
-    with pytest.raises(ValueError, match="no router\nuse --adapt posterior,z,all,scratch$"):
+    with pytest.raises(ValueError, match="no router\nuse --adapt posterior,z,all,search,scratch$"):
         check_run(config, options)
 
 

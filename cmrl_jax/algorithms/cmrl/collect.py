@@ -276,15 +276,16 @@ def imposed_actions(
     """Actions (time, lane, act) in place of the policy's in an iteration, and where (time, lane).
 
     Iteration 0 may be uniform noise throughout. In any other an episode begins with up to
-    `collect.scatter` steps of one random action, so that the policy learns to go on from wherever
-    they lead to.
+    `collect.scatter` steps, and half of it at most, of one random action, so that the policy
+    learns to go on from wherever they lead to.
     """
     collect, horizon = config.collect, config.env.horizon
     k_uniform, k_push, k_length = jax.random.split(key, 3)
     draw = lambda key, *lead: jax.random.uniform(
         key, (*lead, collect.lanes, action_size), minval=-1.0, maxval=1.0
     )
-    length = jax.random.randint(k_length, (collect.lanes,), 0, collect.scatter + 1)
+    most = min(collect.scatter, horizon // 2)
+    length = jax.random.randint(k_length, (collect.lanes,), 0, most + 1)
     scattered = jnp.arange(horizon)[:, None] < length
     is_random = is_first & (collect.initial == "random")
     return jnp.where(is_random, draw(k_uniform, horizon), draw(k_push)), scattered | is_random

@@ -148,8 +148,6 @@ def _check_sizes(config: Config) -> None:
     cause = f"env.horizon {horizon} is not a multiple of collect.chunk {collect.chunk}"
     cure = f"set collect.chunk: {_divisor(horizon, collect.chunk)}"
     require(horizon % collect.chunk == 0, cause, cure)
-    cause = f"collect.scatter {collect.scatter} leaves nothing of env.horizon {horizon}"
-    require(collect.scatter < horizon, cause, f"set collect.scatter below {horizon}")
     cause = f"sac.n_step {config.sac.n_step} is longer than env.horizon {horizon}"
     require(config.sac.n_step <= horizon, cause, f"set sac.n_step to at most {horizon}")
     capacity = config.train.capacity
