@@ -272,14 +272,14 @@ def _section(cls: type, data: Any, prefix: str, source: _Source) -> Any:
     return cls(**values)
 
 
-def _unknown(key: str, dotted: str, cls: type, where: str) -> None:
+def _unknown(key: str, dotted: str, cls: type, where: str, typed: str = "") -> None:
     prefix = dotted[: len(dotted) - len(key)]
     elsewhere = [name for name, _, _ in leaves(Config()) if name.rpartition(".")[2] == key]
     near = suggest(dotted, [prefix + name for name in _names(cls)])
     if not near and elsewhere:
         near = f"did you mean '{elsewhere[0]}'? "
     cure = f"{near}valid: {', '.join(_names(cls))}"
-    raise ConfigError(f"unknown key '{brief(dotted)}'{where}", cure)
+    raise ConfigError(f"unknown key '{brief(typed or dotted)}'{where}", cure)
 
 
 def _names(cls: type) -> list[str]:
@@ -297,7 +297,7 @@ def _replace(config: Config, dotted: str, value: Any) -> Config:
     *sections, key = dotted.split(".")
     for section in sections:
         if not is_dataclass(field_types(cls).get(section)):
-            _unknown(section, prefix + section, cls, "")
+            _unknown(section, prefix + section, cls, "", dotted)
         owner, cls, prefix = owner[section], field_types(cls)[section], f"{prefix}{section}."
     hint = field_types(cls).get(key)
     if hint is None or is_dataclass(hint):
