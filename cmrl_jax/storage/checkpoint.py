@@ -13,6 +13,7 @@ import logging
 import os
 import re
 import sys
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -356,8 +357,11 @@ def _hush_orbax() -> None:
     """Drops orbax's own log lines (routine steps as warnings) and its stray complaints.
 
     Failures are raised besides being logged. When one array fails, orbax closes its event loop
-    under the others, and each of them complains of that from a thread, where nobody can catch it.
+    under the others, and each of them complains of that from a thread, where nobody can catch it,
+    or that it was never awaited.
     """
+    unawaited = "coroutine 'async_serialize.* was never awaited"
+    warnings.filterwarnings("ignore", unawaited, RuntimeWarning)
     logging.getLogger("absl").addFilter(_is_not_from_orbax)  # the same one is added once
     report = sys.unraisablehook
     if getattr(report, "__name__", "") == "drop_stragglers":
