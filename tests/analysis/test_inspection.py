@@ -20,13 +20,14 @@ from envs.tasks import task_id
 
 RUNS = 4  # of a task: 2 goals, 2 draws each
 PLAIN = {"encoder.goal_fusion": "none", "encoder.p_drop_goal": "0", "encoder.p_empty": "0"}
-PLAIN |= {"collect.group_frac": "0.5,0,0.5"}
+PLAIN |= {"collect.group_frac": "0.5,0,0.5", "encoder.aux": "none"}
 TOLD = PLAIN | {"model.conditioning": "task_id", "tasks.test": "", "collect.group_frac": "1,0,0"}
 TOLD |= {"eval.k": "0", "eval.final_k": "0"}
 
 
 def make_session(**flags):
-    session = Session(small_config(**flags))
+    # Routing that looks at the observation, which `usage_by_hand` computes.
+    session = Session(small_config(**{"model.router_input": "z*obs"} | flags))
     session.env = MovingEnv()
     return session
 

@@ -18,6 +18,7 @@ from envs.tasks import METAWORLD_TASKS as TASKS
 ROOT = Path(__file__).parents[2]
 # One panel is drawn faster than four.
 ONE_TASK = {"tasks.train": "window-open", "tasks.test": "", "train.capacity": "2004"}
+ONE_TASK |= {"encoder.aux": "none"}
 OTHER = {"tasks.train": "drawer-close,window-open,window-close", "tasks.test": "drawer-open"}
 
 
