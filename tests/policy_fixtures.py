@@ -20,9 +20,13 @@ HORIZON = 6
 
 
 def small_config(**flags):
-    """smoke.yaml on native physics with episodes of `HORIZON` steps, in two chunks."""
+    """smoke.yaml on native physics with episodes of `HORIZON` steps, in two chunks.
+
+    With observations as `MovingEnv` has them, and a routing that looks at them.
+    """
     sizes = {"env.horizon": str(HORIZON), "collect.chunk": str(HORIZON // 2)}
-    return load_config("smoke.yaml", {"env.physics": "native", **sizes, **flags})
+    parts = {"env.obs_mode": "metaworld", "model.router_input": "z*obs", "encoder.aux": "none"}
+    return load_config("smoke.yaml", {"env.physics": "native", **parts, **sizes, **flags})
 
 
 class MovingEnv(Ml4Env):

@@ -26,8 +26,7 @@ TOLD |= {"eval.k": "0", "eval.final_k": "0"}
 
 
 def make_session(**flags):
-    # Routing that looks at the observation, which `usage_by_hand` computes.
-    session = Session(small_config(**{"model.router_input": "z*obs"} | flags))
+    session = Session(small_config(**flags))
     session.env = MovingEnv()
     return session
 

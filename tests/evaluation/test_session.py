@@ -34,7 +34,7 @@ SAME = {
 OTHER = {
     "sac.lr": "1.0e-3",
     "env.horizon": "100",
-    "env.obs_mode": "canonical",
+    "env.obs_mode": "metaworld",
     "collect.lanes": "24",
     "goals.table": "zero",
     "tasks.train": "drawer-open,drawer-close",

@@ -134,6 +134,7 @@ def test_options_that_do_not_apply_to_a_run(tmp_path, config, options, cause):
         }
     if "model.conditioning" in config:
         config |= {"eval.k": "[0]", "eval.final_k": "[0]"}
+    config = {"encoder.aux": "none"} | config
     (tmp_path / "config.yaml").write_text(to_yaml(load_config("smoke.yaml", config)))
     with pytest.raises(ConfigError) as error:
         check_run(EvalOptions(**options), tmp_path)
