@@ -59,7 +59,9 @@ def registered():
     del registry.ALGORITHMS["linear"]
 
 
-@pytest.mark.parametrize("method", [pytest.param("cmrl", marks=pytest.mark.slow), "pearl", "sac"])
+@pytest.mark.parametrize(
+    "method", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("cmrl", "pearl")), "sac"]
+)
 def test_it_is_learned(method, tmp_path):
     """Near its edge and not over it at the end, in (almost) every goal of every task."""
     config, overrides = METHODS[method]
