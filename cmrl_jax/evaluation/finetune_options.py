@@ -65,8 +65,13 @@ def check_run(config: Config, options: FinetuneOptions) -> None:
     # Without z a network is told the training tasks' one-hot, or nothing: no part of it is made for
     # another task.
     has = {"z": config.model.conditioning == "z", "router": config.model.net == "soft"}
-    needs = {"posterior": ("z",), "z": ("z",), "router": ("z", "router"), "all": ("z",)}
-    needs["search"] = ("z",)
+    needs = {
+        "posterior": ("z",),
+        "z": ("z",),
+        "router": ("z", "router"),
+        "all": ("z",),
+        "search": ("z",),
+    }
     lacks = {way: [part for part in needs.get(way, ()) if not has[part]] for way in ADAPT}
     if missing := [way for way in options.adapt if lacks[way]]:
         left = [way for way in options.adapt if not lacks[way]]
