@@ -6,12 +6,14 @@ import pwd
 import types
 
 import jax
+import jax.numpy as jnp
 import pytest
 from run_helpers import assert_same_result, native, run_in_shell, smoke, smoke_words
 
+from cmrl_jax import jax_runtime
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import ConfigError
-from cmrl_jax.jax_runtime import cache_directory, check_switches
+from cmrl_jax.jax_runtime import cache_directory, check_switches, jit_repeated
 from cmrl_jax.storage.run_dir import holds_run
 from cmrl_jax.training.trainer import Schedule, _Run
 from envs import goal_sets
@@ -140,3 +142,26 @@ def test_a_switch_of_jax_that_does_not_work_is_two_lines(tmp_path, switch, cause
     assert len(lines) == 2 and lines[0].startswith("error: ") and cause in lines[0], done.stderr
     assert lines[1].startswith(f"fix: {cure}")
     assert not holds_run(run)  # so that the same command can be given again
+
+
+# Compiler options -------------------------------------------------------------------------------
+
+
+def mixed_modules(weights, modules):
+    """What XLA hands to YNNPACK if it may."""
+    return jnp.sum(weights[..., None] * modules[..., None, :, :], axis=-2)
+
+
+def test_repeated_programs_keep_clear_of_ynnpack():
+    inputs = jnp.ones((8, 1, 2, 2)), jnp.ones((8, 16, 2, 64))
+    assert "ynn_fusion" in jax.jit(mixed_modules).lower(*inputs).compile().as_text()
+    assert "ynn_fusion" not in jit_repeated(mixed_modules).lower(*inputs).compile().as_text()
+
+
+def test_a_jaxlib_without_the_option_compiles_as_it_does(monkeypatch):
+    monkeypatch.setattr(jax_runtime, "WITHOUT_YNN", {"xla_cpu_no_such_option": ""})
+    jax_runtime.repeated_options.cache_clear()
+    try:
+        assert jax_runtime.repeated_options() == {}
+    finally:
+        jax_runtime.repeated_options.cache_clear()

@@ -28,7 +28,7 @@ from cmrl_jax.commands import CHILD
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import Config, ConfigError, call_envs
 from cmrl_jax.evaluation.session import Session, prepare_jax
-from cmrl_jax.jax_runtime import jit_once
+from cmrl_jax.jax_runtime import jit_once, jit_repeated
 from cmrl_jax.places import ROOT
 from cmrl_jax.storage.versions import package_versions
 from envs.outputs import write_json
@@ -85,7 +85,7 @@ def bench_learner(config: Config, report: Report) -> None:
 
         return jax.lax.scan(step, state, jax.random.split(key, GRADIENT_STEPS))[0]
 
-    compiled = jax.jit(updates).lower(run.learner, jax.random.key(2)).compile()
+    compiled = jit_repeated(updates).lower(run.learner, jax.random.key(2)).compile()
     seconds = best_seconds(lambda: compiled(run.learner, jax.random.key(2)))
     shape = f"{len(config.tasks.train)}x{config.sac.batch}"
     report.add("learner/gradient_steps_per_s", GRADIENT_STEPS / seconds, "1/s", batch=shape)

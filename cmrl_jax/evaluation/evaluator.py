@@ -24,6 +24,7 @@ from cmrl_jax.config.schema import Config
 from cmrl_jax.evaluation.controls import sources, take_lanes
 from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
 from cmrl_jax.evaluation.options import MOST_DRAWS, ZSource
+from cmrl_jax.jax_runtime import jit_repeated
 from envs.base import MetaEnv
 
 GOAL_IDS = 1000  # more than the goals of any set
@@ -119,7 +120,7 @@ class Evaluator:
         self.lanes, self.policies = lanes, policies
         self.horizon = horizon or config.env.horizon
         self._train_tasks, self._env, self._agent = config.tasks.train, env, agent
-        self._episode = jax.jit(make_episode(env, agent, self.horizon))
+        self._episode = jit_repeated(make_episode(env, agent, self.horizon))
         self._compiled: Any = None
 
     @property

@@ -30,7 +30,7 @@ from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config
 from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
 from cmrl_jax.evaluation.finetune_options import FREE_Z, FinetuneOptions
-from cmrl_jax.jax_runtime import jit_once
+from cmrl_jax.jax_runtime import jit_once, jit_repeated
 from cmrl_jax.nn import normalizers
 from cmrl_jax.nn.context import Belief, ContextInference, init_belief, make_context_inference
 from cmrl_jax.nn.distributions import Gaussian
@@ -271,8 +271,8 @@ class FineTuning:
             freeze_statistics=adapt != "scratch",
             learn_at_once=True,
         )
-        self.iteration = jax.jit(iteration, donate_argnums=0)
-        self.episode = jax.jit(make_episode(self.env, self.agent, self.config.env.horizon))
+        self.iteration = jit_repeated(iteration, donate_argnums=0)
+        self.episode = jit_repeated(make_episode(self.env, self.agent, self.config.env.horizon))
         # As programs: op by op, each of their hundreds of shapes would be compiled by itself.
         init = jit_once(lambda key: init_run(self.config, self.env, learner, key))
         start = jit_once(

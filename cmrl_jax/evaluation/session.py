@@ -22,7 +22,13 @@ from cmrl_jax.algorithms.base import Agent, Algorithm, RunState
 from cmrl_jax.config.schema import Config, call_envs
 from cmrl_jax.evaluation.controls import text_per_goal
 from cmrl_jax.evaluation.evaluator import Evaluator, Trial
-from cmrl_jax.jax_runtime import cache_directory, check_switches, first_device, jit_once
+from cmrl_jax.jax_runtime import (
+    cache_directory,
+    check_switches,
+    first_device,
+    jit_once,
+    jit_repeated,
+)
 from cmrl_jax.registry import algorithm, environment, make_algorithm, make_environment, rules_of
 from cmrl_jax.storage.checkpoint import policy_store
 from cmrl_jax.storage.versions import package_versions
@@ -69,7 +75,7 @@ class TrainingProgram:
         iteration = algorithm.make_iteration(goals)
         with parallel.using(mesh):
             # Traced once, for the columns and for the program: tracing the physics takes seconds.
-            program = jax.jit(iteration, donate_argnums=0, out_shardings=(places, None))
+            program = jit_repeated(iteration, donate_argnums=0, out_shardings=(places, None))
             self._traced = program.trace(self.abstract)
         self.metrics = self._traced.out_info[1]
         self._compiled: Any = None
