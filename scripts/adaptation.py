@@ -48,7 +48,7 @@ KINDS = {
     "untrained": "--config ml4.yaml --train.env_steps 19200",
 }
 _K = f"--k {','.join(map(str, K))}"
-_TASK = "--protocol task --eval-seeds 10"  # ten adaptation runs, each on goals in its own order
+_TASK = "--protocol task --eval-seeds 5"  # five adaptation runs, each on goals in its own order
 EVALUATIONS = {
     "search-task": f"--adapt search {_K} {_TASK}",
     "search-goal": f"--adapt search {_K}",
@@ -58,7 +58,7 @@ EVALUATIONS = {
     "text-shuffled": "--k 0 --text-control shuffled",
     "text-zero": "--k 0 --text-control zero",
     "trained": "--k 0",
-    "trained-search": "--adapt search --k 20",
+    "trained-search": "--adapt search --k 20 --protocol task --eval-seeds 3",
 }
 OF_KIND = {
     "cmrl": tuple(EVALUATIONS),

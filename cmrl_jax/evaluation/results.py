@@ -75,7 +75,8 @@ def score(run: Path, session: Session, policy: Policy, options: EvalOptions) -> 
     tasks = evaluated_tasks(options, config)
     trial = trial_of([policy], session, options, tasks)
     unit = config.eval.goals * len(session.eval_tasks)
-    lanes = batch_lanes(len(tasks) * options.goals * options.draws, unit, lane_budget(options))
+    total = len(tasks) * options.goals * options.draws
+    lanes = batch_lanes(total, unit, lane_budget(options, len(tasks)))
     evaluator = session.evaluator(lanes, options.horizon, adapt=options.adapt)
     k = ks_of(options, config)
     scores = of_policy(evaluator.run([policy.params], trial, k, options.seed), 0)

@@ -138,7 +138,8 @@ def evaluate_group(
     prepare_jax(targets[0].config)  # each program has the precision of its own runs
     session = Session(targets[0].config)
     most = max(len(tasks) for tasks in todo.values())
-    plan = plan_batches(len(targets), most, options.goals * options.draws, lane_budget(options))
+    budget = lane_budget(options, most)
+    plan = plan_batches(len(targets), most, options.goals * options.draws, budget)
     first = load_target(targets[0], session)
     evaluator = compiled_evaluator(session, first, options, plan, progress)
     per_task = options.goals * options.draws

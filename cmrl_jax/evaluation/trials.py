@@ -23,6 +23,7 @@ from envs.goal_names import GOALS
 
 LANES = {"cpu": 256}
 LANES_ON_ACCELERATORS = 8192
+NARROW = 32  # lanes of a batch of which a CPU is to pad as little as it can
 MEMORY_SHARE = 0.7
 
 
@@ -34,9 +35,17 @@ def evaluation_config(run: Path, physics: Literal["mjx", "native"] | None) -> Co
     return replace(config, env=replace(config.env, physics=physics))
 
 
-def lane_budget(options: EvalOptions) -> int:
-    """Parallel episodes in a batch: as asked, else what keeps the device busy."""
-    return options.lanes or LANES.get(jax.default_backend(), LANES_ON_ACCELERATORS)
+def lane_budget(options: EvalOptions, tasks: int) -> int:
+    """Parallel episodes in a batch: as asked, else what keeps the device busy.
+
+    By task, an adaptation episode has one lane a task and draw, and fills the batch with copies of
+    it, which a CPU pays for: there such batches are narrow.
+    """
+    if options.lanes:
+        return options.lanes
+    if options.protocol == "task" and jax.default_backend() == "cpu":
+        return max(NARROW, tasks * options.draws)
+    return LANES.get(jax.default_backend(), LANES_ON_ACCELERATORS)
 
 
 def batch_lanes(lanes: int, unit: int, budget: int) -> int:

@@ -17,7 +17,7 @@ from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.evaluation.options import EvalOptions
 from cmrl_jax.evaluation.session import Session
 from cmrl_jax.evaluation.targets import IDLE, Target, columns_of, program_key, targets_of
-from cmrl_jax.evaluation.trials import Plan, fitted, plan_batches
+from cmrl_jax.evaluation.trials import Plan, fitted, lane_budget, plan_batches
 from cmrl_jax.text.goal_files import table_path
 
 
@@ -48,6 +48,14 @@ def test_batches_are_equally_full(policies, room, side):
     """Not 5 and then 1 beside 4 copies of itself, which cost as much as 5."""
     assert plan_batches(policies, tasks=4, per_task=50, budget=50 * room + 6).policies == side
     assert fitted(Plan(policies, 50), needed=policies * 50, limit=50 * room) == Plan(side, 50)
+
+
+def test_batches_by_task_are_narrow_where_lanes_cost():
+    """Ten draws of one task learn in ten lanes; in 256 they would play each of them 25 times."""
+    by_task = EvalOptions(protocol="task", draws=10)
+    assert lane_budget(by_task, tasks=1) == 32 and lane_budget(by_task, tasks=4) == 40
+    assert lane_budget(EvalOptions(draws=10), tasks=1) == 256
+    assert lane_budget(replace(by_task, lanes=7), tasks=4) == 7
 
 
 def test_another_policy_in_its_place_is_another_cell(run, tmp_path):
