@@ -44,7 +44,7 @@ K = (0, 1, 2, 5, 10, 20)
 KINDS = {
     "cmrl": "--config ml4.yaml",
     "pearl": "--config pearl.yaml --env.obs_mode canonical --collect.scatter 40"
-    " --train.capacity 340000 --train.env_steps 600000",
+    " --train.capacity 340000 --train.env_steps 600000 --sac.policy_average 0.1",
     "untrained": "--config ml4.yaml --train.env_steps 19200",
 }
 _K = f"--k {','.join(map(str, K))}"

@@ -50,6 +50,7 @@ FORMER_DEFAULTS = {
     "encoder.p_empty": 0.15,
     "encoder.p_drop_goal": 0.2,
     "kl.beta": 0.1,
+    "sac.policy_average": 0.0,
     "collect.scatter": 0,
     "train.env_steps": 1_000_000,
     "train.capacity": 102_400,

@@ -184,6 +184,12 @@ class SacConfig:
     batch: int = doc(128, "B: transitions per task row in an update", above=0)
     task_rows: int = doc(0, "task rows in an update, drawn with replacement; 0: each task once")
     lr: float = doc(3.0e-4, "Adam learning rate of every network", above=0)
+    policy_average: float = doc(
+        0.1,
+        "what acts in evaluation is an average of actor and encoder over about this share of the "
+        "gradient steps so far; 0: they themselves",
+        high=1,
+    )
     grad_clip: float = doc(1.0, "global-norm clip of every network; 0: none")
     normalize_obs: bool = doc(True, "running mean and std of the observations")
 

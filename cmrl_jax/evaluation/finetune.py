@@ -98,6 +98,7 @@ def finetune_config(
     else:
         scale = config.sac.reward_scale / denominator
         sac = replace(config.sac, reward_norm="none", reward_scale=scale, task_rows=0)
+    sac = replace(sac, policy_average=0.0)  # read-outs act by what the last episode taught
     encoder = config.encoder
     if encoder.aux == "contrastive":
         encoder = replace(encoder, aux="none")  # one task alone has nothing to be told from
@@ -211,12 +212,13 @@ def start_state(
     if adapt == "scratch":
         return jax.tree.map(jnp.copy, fresh)  # every leaf a buffer of its own, to be donated
     kept = {name: getattr(trained, name) for name in _NETWORKS}
+    kept["actor_params"], kept["encoder_params"] = trained.acting
     if adapt in FREE_Z:
         if z is None:
             bottleneck = replace(config.encoder, information_bottleneck=True)
             original = make_context_inference(replace(config, encoder=bottleneck), learner.networks)
             belief, told = init_belief((), original.latent_dim), jnp.ones(())
-            z = original.posterior_of_belief(trained.encoder_params, belief, text, told).mean
+            z = original.posterior_of_belief(kept["encoder_params"], belief, text, told).mean
         kept["encoder_params"] = {FREE_LATENT: z}
         fresh = replace(fresh, encoder_opt_state=init_adam(kept["encoder_params"]))
     state = replace(

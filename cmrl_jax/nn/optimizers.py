@@ -70,6 +70,6 @@ def adam_step(
     return unravel(new, params), opt_state, norm
 
 
-def polyak(online: Any, target: Any, tau: float) -> Any:
+def polyak(online: Any, target: Any, tau: float | jax.Array) -> Any:
     """target <- (1 - tau) target + tau online."""
     return jax.tree.map(lambda new, old: old + tau * (new - old), online, target)

@@ -25,9 +25,10 @@ from learner_fixtures import (
     tiny_config,
 )
 
-from cmrl_jax.algorithms.cmrl.learner import Learner, per_task
+from cmrl_jax.algorithms.cmrl.learner import Acting, Learner, per_task
 from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch, routing_health
 from cmrl_jax.algorithms.common import replay
+from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.nn.distributions import sample_tanh_gaussian
 from cmrl_jax.nn.networks import Routing
 from cmrl_jax.nn.optimizers import adam_step, clip_by_norm, init_adam, ravel, unravel
@@ -186,6 +187,25 @@ def test_one_step_moves_every_network_and_the_targets_by_tau(variant, ring, cmrl
         assert np.all(moved_alpha != 0.0)
         moments = np.unique(np.asarray(new.alpha_opt_state[0].mu))  # Adam's first step is a sign
         assert (len(moments) == 1) == (cfg.sac.alpha == "shared")
+
+
+def test_what_acts_is_the_average_of_the_last_tenth(cmrl, ring):
+    share, state, mean = 0.1, cmrl.state, None
+    for n in range(4):
+        state, _ = cmrl.update(state, ring, ring, jax.random.key(n))
+        newest, rate = Acting(state.actor_params, state.encoder_params), 1 / (1 + share * n)
+        blend = lambda old, new, rate=rate: old + rate * (np.asarray(new) - old)
+        mean = newest if mean is None else jax.tree.map(blend, mean, newest)
+    for got, want in zip(jax.tree.leaves(state.acting), jax.tree.leaves(mean), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
+
+
+def test_without_averaging_the_networks_themselves_act(ring):
+    state = jit_once(Learner(tiny_config(sac={"policy_average": 0.0}), GOALS, OBS, ACT).init)(
+        jax.random.key(0)
+    )
+    assert state.averaged is None
+    assert state.acting == (state.actor_params, state.encoder_params)
 
 
 def test_non_finite_gradient_changes_nothing_but_its_counter(cmrl):

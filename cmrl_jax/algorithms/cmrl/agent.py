@@ -46,7 +46,7 @@ def make_policy_params(learner: Learner) -> Callable[[RunState], PolicyParams]:
         # The same draw each time: the state alone decides.
         context = sample_transitions(ring, jax.random.key(0), row, n)
         posterior = inference.posterior(
-            state.encoder_params,
+            state.acting.encoder,
             learner.normalized(state.obs_stats, context),
             jnp.broadcast_to(ring.size > 0, (len(row), n)),
             learner.goal_vectors[row, 0],
@@ -57,7 +57,7 @@ def make_policy_params(learner: Learner) -> Callable[[RunState], PolicyParams]:
     def policy_params(run: RunState) -> PolicyParams:
         state = run.learner
         task_z = None if inference is None else mean_z(state, run.context)
-        return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats, task_z)
+        return PolicyParams(*state.acting, state.obs_stats, task_z)
 
     return policy_params
 

@@ -1,6 +1,7 @@
 """The learner: its state, and one gradient step as a pure function, which the caller scans.
 
-Order of a step (as in oyster): critics and encoder, actor, temperature, target networks.
+Order of a step (as in oyster): critics and encoder, actor, temperature, target networks;
+then the average that acts.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +33,13 @@ from cmrl_jax.nn.networks import Params, Routing, make_networks
 from cmrl_jax.nn.optimizers import adam_step, init_adam, polyak
 
 
+class Acting(NamedTuple):
+    """The parameters that act."""
+
+    actor: Params
+    encoder: Params | None
+
+
 @struct.dataclass
 class TrainState:
     """Everything that is learned or counted; a field that the configuration lacks is None.
@@ -40,6 +48,7 @@ class TrainState:
         critic_params, target_critic_params: leading axis 2 on every leaf, the twin critics.
         value_params, target_value_params: the V network of `sac.variant: v`.
         encoder_params: None unless `model.conditioning` is z.
+        averaged: actor and encoder, averaged over gradient steps (`sac.policy_average`).
         log_alpha: log temperature of every training task, (T,).
         obs_stats, return_stats: running statistics (normalizers.py), updated by collection.
         gradient_steps: gradient steps applied, int32; exact below 2^31, where it stands still.
@@ -52,6 +61,7 @@ class TrainState:
     value_params: Params | None
     target_value_params: Params | None
     encoder_params: Params | None
+    averaged: Acting | None
     log_alpha: jax.Array
     actor_opt_state: Any
     critic_opt_state: Any
@@ -62,6 +72,11 @@ class TrainState:
     return_stats: Any
     gradient_steps: jax.Array
     skipped_updates: jax.Array
+
+    @property
+    def acting(self) -> Acting:
+        """What acts in evaluation, and what a policy checkpoint holds."""
+        return self.averaged or Acting(self.actor_params, self.encoder_params)
 
 
 def per_task(rows: jax.Array, task_ids: jax.Array, num_tasks: int) -> jax.Array:
@@ -163,6 +178,7 @@ class Learner:
         critic_params = networks.init_critic(k_critic)
         value_params = networks.init_value(k_value) if has_value else None
         encoder_params = networks.init_encoder(k_encoder) if networks.init_encoder else None
+        averages = config.sac.policy_average > 0
         log_alpha = jnp.full((self.num_tasks,), math.log(config.sac.alpha_init), jnp.float32)
 
         def copy(params: Any) -> Any:  # a donated state must not hold one buffer twice
@@ -175,6 +191,7 @@ class Learner:
             value_params=value_params,
             target_value_params=copy(value_params) if has_value else None,
             encoder_params=encoder_params,
+            averaged=copy(Acting(actor_params, encoder_params)) if averages else None,
             log_alpha=log_alpha,
             actor_opt_state=init_adam(actor_params),
             critic_opt_state=init_adam(critic_params, stacked=True),
@@ -262,7 +279,7 @@ class Learner:
         norms: Metrics = {}
         new, zc, critic_metrics = self._critic_step(state, data, norms)
         new, log_prob, actor_metrics = self._actor_step(new, zc, data, norms)
-        new = self._target_step(new)
+        new = self._averaging_step(self._target_step(new))
         if sac.alpha != "fixed":
             grad = jax.grad(self.objectives.alpha)(state.log_alpha, log_prob, data.task_ids)
             log_alpha, opt_state, norms["alpha"] = adam_step(
@@ -338,3 +355,16 @@ class Learner:
             return replace(state, target_value_params=target)
         target = polyak(state.critic_params, state.target_critic_params, tau)
         return replace(state, target_critic_params=target)
+
+    def _averaging_step(self, state: TrainState) -> TrainState:
+        """Polynomial-decay averaging (Shamir and Zhang 2013): the newest weighs 1 / (1 + share n).
+
+        After n steps the mean age of what is averaged is n share / (1 + share), however long a run
+        is; a fixed rate would have to be chosen for its length.
+        """
+        if state.averaged is None:
+            return state
+        steps = state.gradient_steps.astype(jnp.float32)
+        rate = 1.0 / (1.0 + self.config.sac.policy_average * steps)
+        newest = Acting(state.actor_params, state.encoder_params)
+        return replace(state, averaged=polyak(newest, state.averaged, rate))

@@ -40,6 +40,7 @@ class Rules(AlgorithmRules):
         "sac.task_reduce",
         "sac.loss_balance",
         "sac.policy_reg",
+        "sac.policy_average",
         "sac.batch",
         "sac.task_rows",
         "sac.lr",
