@@ -26,6 +26,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
+from cmrl_jax.cli.main import main as main_of_train  # noqa: E402
 from cmrl_jax.config.schema import ConfigError  # noqa: E402
 from cmrl_jax.evaluation.statistics import seeds_interval  # noqa: E402
 from cmrl_jax.storage.documents import read_json  # noqa: E402
@@ -49,7 +50,7 @@ KINDS = {
 }
 _K = f"--k {','.join(map(str, K))}"
 _TASK = "--protocol task --eval-seeds 5"  # five adaptation runs, each on goals in its own order
-EVALUATIONS = {
+EVALUATIONS = {  # flags of `eval`; native physics unless they say otherwise
     "search-task": f"--adapt search {_K} {_TASK}",
     "search-goal": f"--adapt search {_K}",
     "posterior-task": f"{_K} {_TASK}",
@@ -59,12 +60,15 @@ EVALUATIONS = {
     "text-zero": "--k 0 --text-control zero",
     "trained": "--k 0",
     "trained-search": "--adapt search --k 20 --protocol task --eval-seeds 3",
+    # Its own function adapts for 10 episodes and counts the 3 after them.
+    "metaworld": "--adapt search --physics metaworld --k 0",
 }
 OF_KIND = {
     "cmrl": tuple(EVALUATIONS),
     "pearl": ("posterior-task", "posterior-goal", "search-task", "search-goal", "trained"),
     "untrained": ("search-task", "search-goal"),
 }
+FINETUNE = "finetune"  # from the winner of a search, and SAC from scratch; needs the run itself
 
 
 def runs() -> list[str]:
@@ -88,14 +92,28 @@ def train_command(name: str) -> list[str]:
     return words + (["--resume"] if (RUNS / name / "config.yaml").exists() else [])
 
 
+def evaluations_of(name: str) -> list[str]:
+    """What is asked of a run: Meta-World itself in the paper's fold alone, fine-tuning of one seed,
+    since both take long."""
+    kind, fold, seed = parts(name)
+    asked = [x for x in OF_KIND[kind] if x != "metaworld" or fold == "window-close"]
+    return [*asked, FINETUNE] if kind == "cmrl" and seed == 0 else asked
+
+
 def score_command(name: str, evaluation: str) -> list[str]:
-    """What a user would type for an evaluation of a run's kept policy."""
+    """What a user would type for an evaluation of a run's kept policy, or for its fine-tuning."""
     _, fold, _ = parts(name)
+    out = ["--json", str(SCORES / name / f"{evaluation}.json")]
+    if evaluation == FINETUNE:
+        run = ["--run", str(RUNS / name), "--task", fold, "--physics", "native"]
+        return ["train.py", "finetune", *run, "--adapt", "search,scratch", *out]
     trained = ",".join(task for task in TASKS if task != fold)
     tasks = trained if evaluation.startswith("trained") else fold
     words = ["train.py", "eval", "--run", str(POLICIES / name), "--tasks", tasks]
-    words += ["--physics", "native", *shlex.split(EVALUATIONS[evaluation])]
-    return [*words, "--json", str(SCORES / name / f"{evaluation}.json")]
+    flags = shlex.split(EVALUATIONS[evaluation])
+    # One number of lanes for all, so that one program serves all.
+    usual = [] if "--physics" in flags else ["--physics", "native", "--lanes", "50"]
+    return [*words, *usual, *flags, *out]
 
 
 def keep(name: str) -> None:
@@ -126,19 +144,29 @@ def train(names: list[str]) -> int:
 def score(names: list[str]) -> int:
     """Makes the evaluations that are missing of the policies that are there."""
     for name in names:
-        for evaluation in OF_KIND[parts(name)[0]]:
-            out = SCORES / name / f"{evaluation}.json"
-            if out.exists() or not (POLICIES / name).exists():
-                continue
-            out.parent.mkdir(parents=True, exist_ok=True)
-            print(f"== {name} {evaluation}", flush=True)
-            cells = out.with_suffix(".csv")
-            cells.unlink(missing_ok=True)  # of a command that was stopped
-            command = [sys.executable, *score_command(name, evaluation), "--csv", str(cells)]
-            if code := subprocess.run(command, cwd=ROOT).returncode:
-                return code
-            keep_goals(cells, out)
+        for evaluation in evaluations_of(name):
+            needs = RUNS / name / "ckpt" if evaluation == FINETUNE else POLICIES / name
+            if not (SCORES / name / f"{evaluation}.json").exists() and needs.exists():
+                print(f"== {name} {evaluation}", flush=True)
+                if code := score_once(name, evaluation):
+                    return code
     return 0
+
+
+def score_once(name: str, evaluation: str) -> int:
+    """Makes one evaluation; its exit code."""
+    out = SCORES / name / f"{evaluation}.json"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    cells = out.with_suffix(".csv")
+    cells.unlink(missing_ok=True)  # of a command that was stopped
+    _, *words = score_command(name, evaluation)
+    # In this process, where what was compiled for one evaluation serves the next.
+    if evaluation == FINETUNE:
+        return main_of_train(words)
+    code = main_of_train([*words, "--csv", str(cells)])
+    if not code:
+        keep_goals(cells, out)
+    return code
 
 
 def keep_goals(cells: Path, out: Path) -> None:
@@ -157,6 +185,7 @@ def keep_goals(cells: Path, out: Path) -> None:
 
 
 CURVES = ("cmrl", "cmrl-posterior", "pearl", "pearl-search", "untrained-search", "random-arm")
+GRADIENTS = ("finetune", "scratch")
 METHODS = {  # of (kind, adapt)
     ("cmrl", "search"): "cmrl",
     ("cmrl", "posterior"): "cmrl-posterior",
@@ -175,6 +204,11 @@ def rows_of(name: str) -> list[dict[str, Any]]:
         row = {"fold": fold, "method": method, "protocol": protocol, "seed": seed, "k": k}
         rows.append(row | {x: figures[x] for x in FIGURES})
 
+    path = SCORES / name / f"{FINETUNE}.json"
+    curves = read_json(path, "remove it, and score again")["curves"] if path.exists() else {}
+    for adapt, curve in curves.items():
+        for k, figures in curve.items():
+            add({"search": "finetune"}.get(adapt, adapt), "task", int(k), figures)
     for adapt, protocol in itertools.product(("search", "posterior"), ("task", "goal")):
         for k, figures in figures_of(name, f"{adapt}-{protocol}", fold).items():
             add(METHODS[kind, adapt], protocol, k, figures)
@@ -217,6 +251,8 @@ def table(names: list[str]) -> int:
         print("", *markdown(rows, protocol), sep="\n")
     print("", *intervals(names), sep="\n")
     print("", *trained_tasks(names), sep="\n")
+    print("", *in_metaworld(names), sep="\n")
+    print("", *episodes_needed(rows), sep="\n")
     draw_curves(rows, RESULTS / "curves.png")
     return 0
 
@@ -275,6 +311,35 @@ def trained_tasks(names: list[str]) -> list[str]:
     return lines
 
 
+def in_metaworld(names: list[str]) -> list[str]:
+    """Success that Meta-World's own `metalearning_evaluation` reports of the search."""
+    lines = ["| run | Meta-World's own evaluation, after 10 episodes |", "| --- | --- |"]
+    for name in names:
+        path = SCORES / name / "metaworld.json"
+        if path.exists():
+            own = read_json(path, "remove it, and score again")["metalearning_evaluation"]["tasks"]
+            lines.append(f"| {name} | {own[parts(name)[1]]['mean_success_rate']:.2f} |")
+    return lines
+
+
+def episodes_needed(rows: list[dict[str, Any]], enough: float = 0.8) -> list[str]:
+    """Own episodes at the first read-out with that much success, by where gradient steps begin."""
+    lines = [f"| fold | {' | '.join(GRADIENTS)} |", "| --- |" + " --- |" * len(GRADIENTS)]
+    for fold in TASKS:
+        cells = []
+        for method in GRADIENTS:
+            ks = [
+                row["k"]
+                for row in rows
+                if (row["fold"], row["method"], row["protocol"]) == (fold, method, "task")
+                and row["success_any"] >= enough
+            ]
+            cells.append(str(min(ks)) if ks else "")
+        if any(cells):
+            lines.append(f"| {fold} | {' | '.join(cells)} |")
+    return lines
+
+
 def draw_curves(rows: list[dict[str, Any]], path: Path) -> None:
     """Success against own episodes, a panel a fold: mean over seeds, and every seed of CMRL."""
     from matplotlib.figure import Figure
@@ -309,7 +374,7 @@ def main(words: list[str]) -> int:
     if "--list" in words:
         for name in runs():
             print(f"python {shlex.join(train_command(name))}")
-            for evaluation in OF_KIND[parts(name)[0]]:
+            for evaluation in evaluations_of(name):
                 print(f"python {shlex.join(score_command(name, evaluation))}")
         return 0
     step, chosen = words[:1], words[1:]
