@@ -1,10 +1,12 @@
-"""The adaptation table: `python scripts/adaptation.py train`, then `score`, then `table`.
+"""The adaptation table: `python scripts/adaptation.py train`, `score`, `finetune`, then `table`.
 
 Each of the four tasks is held out once, a fold, with five seeds. `train` makes the runs, one after
 another; what is finished is left alone and what was stopped goes on, so it can be stopped and given
 again at any time. Runs go to runs/adaptation/NAME; config, versions, command and the last policy of
 each are copied to results/adaptation/policies/NAME. `score` evaluates those copies, one JSON an
-evaluation in results/adaptation/scores/NAME; what is there already is not run again. `table` puts
+evaluation in results/adaptation/scores/NAME; what is there already is not run again. `finetune` goes
+on from the winner of a search with gradient steps, beside SAC from scratch, for one seed a fold: it
+needs the run itself. `table` puts
 them together as results/adaptation/folds.json, the figures and the Markdown of README. `--list`
 prints every command. Names after the word choose among the runs.
 """
@@ -93,11 +95,9 @@ def train_command(name: str) -> list[str]:
 
 
 def evaluations_of(name: str) -> list[str]:
-    """What is asked of a run: Meta-World itself in the paper's fold alone, fine-tuning of one seed,
-    since both take long."""
-    kind, fold, seed = parts(name)
-    asked = [x for x in OF_KIND[kind] if x != "metaworld" or fold == "window-close"]
-    return [*asked, FINETUNE] if kind == "cmrl" and seed == 0 else asked
+    """What is asked of a run's policy; of Meta-World's own function in the paper's fold alone."""
+    kind, fold, _ = parts(name)
+    return [x for x in OF_KIND[kind] if x != "metaworld" or fold == "window-close"]
 
 
 def score_command(name: str, evaluation: str) -> list[str]:
@@ -111,7 +111,7 @@ def score_command(name: str, evaluation: str) -> list[str]:
     tasks = trained if evaluation.startswith("trained") else fold
     words = ["train.py", "eval", "--run", str(POLICIES / name), "--tasks", tasks]
     flags = shlex.split(EVALUATIONS[evaluation])
-    # One number of lanes for all, so that one program serves all.
+    # One number of lanes for all, so that a way to adapt is one program for all.
     usual = [] if "--physics" in flags else ["--physics", "native", "--lanes", "50"]
     return [*words, *usual, *flags, *out]
 
@@ -145,11 +145,22 @@ def score(names: list[str]) -> int:
     """Makes the evaluations that are missing of the policies that are there."""
     for name in names:
         for evaluation in evaluations_of(name):
-            needs = RUNS / name / "ckpt" if evaluation == FINETUNE else POLICIES / name
-            if not (SCORES / name / f"{evaluation}.json").exists() and needs.exists():
+            is_there = (SCORES / name / f"{evaluation}.json").exists()
+            if (POLICIES / name).exists() and not is_there:
                 print(f"== {name} {evaluation}", flush=True)
                 if code := score_once(name, evaluation):
                     return code
+    return 0
+
+
+def finetune(names: list[str]) -> int:
+    """Fine-tunes the first seed of every fold, where its run has ended and lies here."""
+    for name in (n for n in names if n.startswith("cmrl") and parts(n)[2] == 0):
+        is_ended = (POLICIES / name).exists() and (RUNS / name / "ckpt").exists()
+        if is_ended and not (SCORES / name / f"{FINETUNE}.json").exists():
+            print(f"== {name} {FINETUNE}", flush=True)
+            if code := score_once(name, FINETUNE):
+                return code
     return 0
 
 
@@ -157,15 +168,18 @@ def score_once(name: str, evaluation: str) -> int:
     """Makes one evaluation; its exit code."""
     out = SCORES / name / f"{evaluation}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
-    cells = out.with_suffix(".csv")
-    cells.unlink(missing_ok=True)  # of a command that was stopped
+    part, cells = out.with_suffix(".part.json"), out.with_suffix(".part.csv")
+    for path in (part, cells):  # of a command that was stopped
+        path.unlink(missing_ok=True)
     _, *words = score_command(name, evaluation)
+    words[words.index(str(out))] = str(part)
+    table = [] if evaluation == FINETUNE else ["--csv", str(cells)]
     # In this process, where what was compiled for one evaluation serves the next.
-    if evaluation == FINETUNE:
-        return main_of_train(words)
-    code = main_of_train([*words, "--csv", str(cells)])
+    code = main_of_train([*words, *table])
     if not code:
-        keep_goals(cells, out)
+        if table:
+            keep_goals(cells, part)
+        part.replace(out)
     return code
 
 
@@ -264,7 +278,8 @@ def markdown(rows: list[dict[str, Any]], protocol: str) -> list[str]:
     by_method: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in rows:
         last = K[-1] if not row["method"].startswith("cmrl-text") else 0
-        if row["protocol"] == protocol and row["k"] == last:
+        counts = row["protocol"] == protocol and row["k"] == last
+        if counts and row["method"] not in GRADIENTS:  # they have a table of their own
             by_method.setdefault(row["method"], {}).setdefault(row["fold"], []).append(row)
     for method, folds in by_method.items():
         cells = []
@@ -323,7 +338,10 @@ def in_metaworld(names: list[str]) -> list[str]:
 
 
 def episodes_needed(rows: list[dict[str, Any]], enough: float = 0.8) -> list[str]:
-    """Own episodes at the first read-out with that much success, by where gradient steps begin."""
+    """Own episodes at the first read-out with that much success, gradient steps included.
+
+    Fine-tuning makes none in the 20 episodes of the search that it begins with.
+    """
     lines = [f"| fold | {' | '.join(GRADIENTS)} |", "| --- |" + " --- |" * len(GRADIENTS)]
     for fold in TASKS:
         cells = []
@@ -367,14 +385,15 @@ def draw_curves(rows: list[dict[str, Any]], path: Path) -> None:
     print(path)
 
 
-STEPS = {"train": train, "score": score, "table": table}
+STEPS = {"train": train, "score": score, "finetune": finetune, "table": table}
 
 
 def main(words: list[str]) -> int:
     if "--list" in words:
         for name in runs():
             print(f"python {shlex.join(train_command(name))}")
-            for evaluation in evaluations_of(name):
+            of_first = [FINETUNE] if name.startswith("cmrl") and name.endswith("-s0") else []
+            for evaluation in evaluations_of(name) + of_first:
                 print(f"python {shlex.join(score_command(name, evaluation))}")
         return 0
     step, chosen = words[:1], words[1:]

@@ -31,6 +31,7 @@ BUDGET = "--env.physics native --train.env_steps 1200000"
 SINGLE = "--config sac.yaml --env.physics native"  # 500,000 env steps
 CMRL = f"--config ml4-plain.yaml {BUDGET}"
 GROUNDED = f"--config ml4.yaml {BUDGET} --collect.scatter 0 --train.capacity 102400"
+GROUNDED += " --sac.policy_average 0"
 # Do words matter? Half the budget, and a KL weight at which z may carry something.
 WORDS = "--config ml4-plain.yaml --env.physics native --train.env_steps 600000 --kl.beta 0.001"
 

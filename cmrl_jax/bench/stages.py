@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from cmrl_jax.bench.physics import Report, best_seconds
+from cmrl_jax.jax_runtime import jit_repeated
 from envs.physics.mjx.backend import (
     LINE_SEARCH_ITERATIONS,
     ROBOT_JOINTS,
@@ -70,14 +71,14 @@ def bench_stages(lane_counts: tuple[int, ...], report: Report) -> None:
 
             return jax.lax.scan(substep, state, None, length=SUBSTEPS)[0].qpos
 
-        return jax.jit(jax.vmap(lane))
+        return jit_repeated(jax.vmap(lane))
 
     for lanes in lane_counts:
         task = jnp.arange(lanes) % len(TASKS)
         state = jax.jit(jax.vmap(start))(task)
         scene_id = scene_ids[task]
         ctrl = jnp.zeros((lanes, 2))
-        whole = jax.jit(jax.vmap(physics.step))
+        whole = jit_repeated(jax.vmap(physics.step))
         jax.block_until_ready(whole(state, ctrl, scene_id))
         seconds = {"whole": best_seconds(lambda: whole(state, ctrl, scene_id), repeats=10)}
         for name, stage in stages.items():

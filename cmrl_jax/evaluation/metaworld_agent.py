@@ -32,6 +32,7 @@ from cmrl_jax.algorithms.common.rollout import select_lanes
 from cmrl_jax.config.schema import EnvConfig
 from cmrl_jax.evaluation.controls import without_experience
 from cmrl_jax.evaluation.episode import action_noise, agent_keys, chunk_keys
+from cmrl_jax.jax_runtime import jit_repeated
 from envs.sawyer import OBJECT, Ml4Env, canonical_obs
 
 OBS_SIZE, ACTION_SIZE = Ml4Env.observation_size, Ml4Env.action_size
@@ -219,14 +220,14 @@ def _compile(
 ) -> _Programs:
     params = jax.device_put(params)
 
-    @jax.jit
+    @jit_repeated
     def act(memory, obs, origin, noise):
         shown = obs
         if env.obs_mode == "canonical":
             shown = canonical_obs(obs, origin, env.goal_observable)
         return agent.act(params, memory, shown, noise, deterministic), shown
 
-    @jax.jit
+    @jit_repeated
     def begin(memory, source, starts, key, episode, lane_id, exploit):
         """The memory with an episode begun where it starts, and all its noise (lane, time, act)."""
 
@@ -241,7 +242,7 @@ def _compile(
         begun = agent.begin_episode(params, memory, source, keys, exploit)
         return select_lanes(starts, begun, memory), noise
 
-    @jax.jit
+    @jit_repeated
     def observe(memory, transitions, mask):
         flag = jnp.zeros(mask.shape, bool)
         whole = Transition(terminated=flag, truncated=flag, first=flag, **transitions)

@@ -12,7 +12,7 @@ from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks, ks_of
 from cmrl_jax.evaluation.scores import cell_rows, format_scores, of_policy, summarise
 from cmrl_jax.evaluation.session import Policy, Session
 from cmrl_jax.evaluation.settings import describe, result_fields, row_columns
-from cmrl_jax.evaluation.trials import batch_lanes, lane_budget, trial_of
+from cmrl_jax.evaluation.trials import eval_lanes, trial_of
 from envs.outputs import write_json
 
 
@@ -75,8 +75,7 @@ def score(run: Path, session: Session, policy: Policy, options: EvalOptions) -> 
     tasks = evaluated_tasks(options, config)
     trial = trial_of([policy], session, options, tasks)
     unit = config.eval.goals * len(session.eval_tasks)
-    total = len(tasks) * options.goals * options.draws
-    lanes = batch_lanes(total, unit, lane_budget(options, len(tasks)))
+    lanes = eval_lanes(options, len(tasks), unit)
     evaluator = session.evaluator(lanes, options.horizon, adapt=options.adapt)
     k = ks_of(options, config)
     scores = of_policy(evaluator.run([policy.params], trial, k, options.seed), 0)

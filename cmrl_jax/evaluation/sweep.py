@@ -138,8 +138,7 @@ def evaluate_group(
     prepare_jax(targets[0].config)  # each program has the precision of its own runs
     session = Session(targets[0].config)
     most = max(len(tasks) for tasks in todo.values())
-    budget = lane_budget(options, most)
-    plan = plan_batches(len(targets), most, options.goals * options.draws, budget)
+    plan = plan_batches(len(targets), most, options.goals * options.draws, lane_budget(options))
     first = load_target(targets[0], session)
     evaluator = compiled_evaluator(session, first, options, plan, progress)
     per_task = options.goals * options.draws

@@ -23,7 +23,6 @@ from envs.goal_names import GOALS
 
 LANES = {"cpu": 256}
 LANES_ON_ACCELERATORS = 8192
-NARROW = 32  # lanes of a batch of which a CPU is to pad as little as it can
 MEMORY_SHARE = 0.7
 
 
@@ -35,17 +34,25 @@ def evaluation_config(run: Path, physics: Literal["mjx", "native"] | None) -> Co
     return replace(config, env=replace(config.env, physics=physics))
 
 
-def lane_budget(options: EvalOptions, tasks: int) -> int:
-    """Parallel episodes in a batch: as asked, else what keeps the device busy.
+def lane_budget(options: EvalOptions) -> int:
+    """Parallel episodes in a batch: as asked, else what keeps the device busy."""
+    return options.lanes or LANES.get(jax.default_backend(), LANES_ON_ACCELERATORS)
 
-    By task, an adaptation episode has one lane a task and draw, and fills the batch with copies of
-    it, which a CPU pays for: there such batches are narrow.
+
+def eval_lanes(options: EvalOptions, tasks: int, unit: int) -> int:
+    """Lanes of a batch for an evaluation of one policy.
+
+    By task, an adaptation episode has one lane a task and draw, and fills its batch with copies of
+    them. A CPU pays for each, so there a batch is no wider than those need.
+
+    Args:
+        unit: see `batch_lanes`.
     """
-    if options.lanes:
-        return options.lanes
-    if options.protocol == "task" and jax.default_backend() == "cpu":
-        return max(NARROW, tasks * options.draws)
-    return LANES.get(jax.default_backend(), LANES_ON_ACCELERATORS)
+    budget, lanes = lane_budget(options), tasks * options.draws
+    is_narrow = options.protocol == "task" and not options.lanes
+    if not (is_narrow and jax.default_backend() == "cpu"):
+        lanes *= options.goals
+    return batch_lanes(lanes, unit, budget)
 
 
 def batch_lanes(lanes: int, unit: int, budget: int) -> int:

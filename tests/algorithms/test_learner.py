@@ -25,6 +25,7 @@ from learner_fixtures import (
     tiny_config,
 )
 
+from cmrl_jax.algorithms.cmrl.agent import make_policy_params
 from cmrl_jax.algorithms.cmrl.learner import Acting, Learner, per_task
 from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch, routing_health
 from cmrl_jax.algorithms.common import replay
@@ -189,7 +190,7 @@ def test_one_step_moves_every_network_and_the_targets_by_tau(variant, ring, cmrl
         assert (len(moments) == 1) == (cfg.sac.alpha == "shared")
 
 
-def test_what_acts_is_the_average_of_the_last_tenth(cmrl, ring):
+def test_what_acts_is_the_average_of_the_steps_so_far(cmrl, ring):
     share, state, mean = 0.1, cmrl.state, None
     for n in range(4):
         state, _ = cmrl.update(state, ring, ring, jax.random.key(n))
@@ -198,6 +199,19 @@ def test_what_acts_is_the_average_of_the_last_tenth(cmrl, ring):
         mean = newest if mean is None else jax.tree.map(blend, mean, newest)
     for got, want in zip(jax.tree.leaves(state.acting), jax.tree.leaves(mean), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
+
+
+def test_a_policy_is_the_average_and_its_z_is_of_the_averaged_encoder(cmrl, ring):
+    params_of = make_policy_params(cmrl.learner)
+    averaged = spread(cmrl.state.averaged)
+    run = SimpleNamespace(learner=replace(cmrl.state, averaged=averaged), context=ring)
+    alone = replace(cmrl.state, averaged=None)
+    own = replace(alone, actor_params=averaged.actor, encoder_params=averaged.encoder)
+    wanted = params_of(SimpleNamespace(learner=own, context=ring))
+    for got, want in zip(*map(jax.tree.leaves, (params_of(run), wanted)), strict=True):
+        np.testing.assert_array_equal(got, want)
+    other = params_of(SimpleNamespace(learner=alone, context=ring))
+    assert float(np.abs(other.task_z - wanted.task_z).max()) > 1e-3
 
 
 def test_without_averaging_the_networks_themselves_act(ring):

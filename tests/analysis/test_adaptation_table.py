@@ -24,7 +24,7 @@ def table(monkeypatch, tmp_path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(document))
 
-    script.put = put
+    monkeypatch.setattr(script, "put", put, raising=False)
     return script
 
 

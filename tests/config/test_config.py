@@ -204,13 +204,15 @@ def test_ml4_names_every_key_that_matters():
 def test_a_key_that_an_older_run_lacks_has_the_default_of_its_time(tmp_path):
     """Also where the default is another one today; a file that is no run's record has today's."""
     record = to_dict(load_config("ml4-plain.yaml"))
-    for section, key in (("collect", "scatter"), ("encoder", "aux"), ("env", "obs_mode")):
+    lacking = ("collect", "scatter"), ("encoder", "aux"), ("env", "obs_mode")
+    for section, key in (*lacking, ("sac", "policy_average")):
         del record[section][key]
     path = tmp_path / "x.yaml"
     path.write_text(yaml.safe_dump(record))
     plain = load_config("ml4-plain.yaml")
     assert load_config(path) == plain and changed_fields(record, plain) == []
-    assert ("collect.scatter", 0, 40) in changed_fields(record, Config())
+    changed = changed_fields(record, Config())
+    assert ("collect.scatter", 0, 40) in changed and ("sac.policy_average", 0.0, 0.1) in changed
     path.write_text("model: {net: mlp}\n")
     assert load_config(path).collect.scatter == 40
 

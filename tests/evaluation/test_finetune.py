@@ -83,7 +83,7 @@ def test_gradient_steps_change_what_is_adapted_and_nothing_else(made, ring, adap
 
 def test_a_free_latent_is_one_point_and_learns(ring):
     """Whatever was seen z is the parameter; the critics' loss moves it, and it alone."""
-    config = tiny_config(encoder={"information_bottleneck": False})
+    config = tiny_config(encoder={"information_bottleneck": False}, sac={"policy_average": 0.0})
     latent = free_latent(config.encoder.latent_dim)
     learner = RestrictedLearner("z", config, GOALS, 3, 2, inference=latent)
     state = jit_once(learner.init)(jax.random.key(0))
@@ -138,10 +138,13 @@ def test_a_new_task_starts_from_the_trained_parts(made):
         actor_params=spread(made.state.actor_params),
         critic_params=spread(made.state.critic_params),
         log_alpha=jnp.array([-1.0, -2.0, -6.0]),
+        averaged=spread(made.state.averaged, seed=2),
     )
     fresh = jit_once(learner.init)(jax.random.key(5))
     state = start_state("all", config, learner, fresh, trained, GOALS[0, 0])
-    assert not changed(trained, state)
+    actor, encoder = trained.averaged  # it begins as what acts, and goes on without an average
+    acting = replace(trained, actor_params=actor, encoder_params=encoder, averaged=None)
+    assert changed(trained, state) and not changed(acting, state)
     np.testing.assert_allclose(state.log_alpha, [-3.0])  # the mean of the training tasks'
     assert not changed(fresh, start_state("scratch", config, learner, fresh, trained, GOALS[0, 0]))
     assert trained.log_alpha.shape == (TASKS,)
@@ -347,7 +350,7 @@ def test_after_a_search_it_begins_where_the_winner_plays(restored, view):
     learner = session.algorithm.parts
     shape = learner.num_tasks, learner.inference.latent_dim
     task_z = np.random.default_rng(0).normal(size=shape).astype(np.float32)
-    params = PolicyParams(trained.actor_params, trained.encoder_params, trained.obs_stats, task_z)
+    params = PolicyParams(*trained.acting, trained.obs_stats, task_z)
     agent = session.agent_of("arms")
     arm = 2 * len(session.env.symmetries[0]) + view
     shown = np.broadcast_to(text, (1, 1, len(placements), len(text)))

@@ -17,7 +17,7 @@ from cmrl_jax.evaluation.evaluator import Evaluator
 from cmrl_jax.evaluation.options import EvalOptions
 from cmrl_jax.evaluation.session import Session
 from cmrl_jax.evaluation.targets import IDLE, Target, columns_of, program_key, targets_of
-from cmrl_jax.evaluation.trials import Plan, fitted, lane_budget, plan_batches
+from cmrl_jax.evaluation.trials import Plan, eval_lanes, fitted, plan_batches
 from cmrl_jax.text.goal_files import table_path
 
 
@@ -53,9 +53,11 @@ def test_batches_are_equally_full(policies, room, side):
 def test_batches_by_task_are_narrow_where_lanes_cost():
     """Ten draws of one task learn in ten lanes; in 256 they would play each of them 25 times."""
     by_task = EvalOptions(protocol="task", draws=10)
-    assert lane_budget(by_task, tasks=1) == 32 and lane_budget(by_task, tasks=4) == 40
-    assert lane_budget(EvalOptions(draws=10), tasks=1) == 256
-    assert lane_budget(replace(by_task, lanes=7), tasks=4) == 7
+    assert [eval_lanes(by_task, tasks, unit=40) for tasks in (1, 4, 5)] == [40, 40, 80]
+    assert eval_lanes(replace(by_task, draws=1000), tasks=4, unit=40) == 256
+    assert eval_lanes(EvalOptions(draws=10), tasks=1, unit=40) == 256
+    assert eval_lanes(EvalOptions(), tasks=1, unit=40) == 80
+    assert eval_lanes(replace(by_task, lanes=7), tasks=4, unit=40) == 7
 
 
 def test_another_policy_in_its_place_is_another_cell(run, tmp_path):

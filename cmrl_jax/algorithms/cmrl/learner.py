@@ -34,7 +34,7 @@ from cmrl_jax.nn.optimizers import adam_step, init_adam, polyak
 
 
 class Acting(NamedTuple):
-    """The parameters that act."""
+    """The parameters that act outside training's own episodes."""
 
     actor: Params
     encoder: Params | None
@@ -359,8 +359,9 @@ class Learner:
     def _averaging_step(self, state: TrainState) -> TrainState:
         """Polynomial-decay averaging (Shamir and Zhang 2013): the newest weighs 1 / (1 + share n).
 
-        After n steps the mean age of what is averaged is n share / (1 + share), however long a run
-        is; a fixed rate would have to be chosen for its length.
+        With a share of 0.1 the last tenth of the steps has two thirds of the weight. After n steps
+        the mean age of what is averaged is n share / (1 + share), however long a run is; a fixed
+        rate would have to be chosen for its length.
         """
         if state.averaged is None:
             return state
