@@ -4,9 +4,9 @@ Each of the four tasks is held out once, a fold, with five seeds. `train` makes 
 another; what is finished is left alone and what was stopped goes on, so it can be stopped and given
 again at any time. Runs go to runs/adaptation/NAME; config, versions, command and the last policy of
 each are copied to results/adaptation/policies/NAME. `score` evaluates those copies, one JSON an
-evaluation in results/adaptation/scores/NAME; what is there already is not run again. `finetune` goes
-on from the winner of a search with gradient steps, beside SAC from scratch, for one seed a fold: it
-needs the run itself. `table` puts
+evaluation in results/adaptation/scores/NAME; what is there already is not run again. `finetune`
+goes on from the winner of a search with gradient steps, beside SAC from scratch, for one seed a
+fold: it needs the run itself. `table` puts
 them together as results/adaptation/folds.json, the figures and the Markdown of README. `--list`
 prints every command. Names after the word choose among the runs.
 """
