@@ -265,6 +265,7 @@ def table(names: list[str]) -> int:
     lines = ",\n".join(json.dumps(row) for row in rows)
     (RESULTS / "folds.json").write_text(f'{{"rows": [\n{lines}\n]}}\n', encoding="utf-8")
     print(f"{RESULTS / 'folds.json'}: {len(rows)} rows")
+    print("", *by_episodes(rows), sep="\n")
     for protocol in ("task", "goal"):
         print("", *markdown(rows, protocol), sep="\n")
     print("", *intervals(names), sep="\n")
@@ -273,6 +274,20 @@ def table(names: list[str]) -> int:
     print("", *episodes_needed(rows), sep="\n")
     draw_curves(rows, RESULTS / "curves.png")
     return 0
+
+
+def by_episodes(rows: list[dict[str, Any]]) -> list[str]:
+    """Any (last) step of the search by task after k own episodes: means over seeds."""
+    lines = [f"| held out | {' | '.join(f'k = {k}' for k in K)} |", "|" + " --- |" * (len(K) + 1)]
+    for fold in TASKS:
+        cells = []
+        for k in K:
+            asked = {"fold": fold, "method": "cmrl", "protocol": "task", "k": k}
+            found = [row for row in rows if asked.items() <= row.items()]
+            means = [sum(row[x] for row in found) / len(found) for x in FIGURES if found]
+            cells.append(f"{means[0]:.2f} ({means[1]:.2f})" if means else "")
+        lines.append(f"| {fold} | {' | '.join(cells)} |")
+    return lines
 
 
 def markdown(rows: list[dict[str, Any]], protocol: str) -> list[str]:
