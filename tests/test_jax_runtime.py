@@ -154,7 +154,8 @@ def mixed_modules(weights, modules):
 
 def test_repeated_programs_keep_clear_of_ynnpack():
     inputs = jnp.ones((8, 1, 2, 2)), jnp.ones((8, 16, 2, 64))
-    if "ynn_fusion" not in jax.jit(mixed_modules).lower(*inputs).compile().as_text():
+    plain = jax.jit(mixed_modules).lower(*inputs).compile().as_text() or ""
+    if "ynn_fusion" not in plain:
         pytest.skip("this jaxlib hands YNNPACK nothing here")
     assert "ynn_fusion" not in jit_repeated(mixed_modules).lower(*inputs).compile().as_text()
 

@@ -10,6 +10,7 @@ from learner_fixtures import GOALS, TASKS, VARIANTS, build, filled_ring, spread,
 
 from cmrl_jax.algorithms.cmrl.diagnostics import CONTEXT_SIZES, make_diagnose
 from cmrl_jax.algorithms.common.replay import sample_transitions
+from cmrl_jax.jax_runtime import jit_once
 
 KEY = jax.random.key(7)
 
@@ -19,7 +20,7 @@ def diagnosed(variant):
     made, ring = build(cfg), filled_ring()
     state = made.state.replace(critic_params=spread(made.state.critic_params))
     diagnose = make_diagnose(cfg, made.learner, GOALS)
-    return made.learner, state, ring, diagnose(state, ring, ring, KEY)
+    return made.learner, state, ring, jit_once(diagnose)(state, ring, ring, KEY)
 
 
 @pytest.mark.slow
@@ -49,7 +50,7 @@ def test_posterior_variance_is_that_of_the_first_transitions():
     context = sample_transitions(ring, key, jnp.arange(TASKS), max(CONTEXT_SIZES))
     for size in CONTEXT_SIZES:
         first = jax.tree.map(lambda x, size=size: x[:, :size], context)
-        posterior = inference.posterior(
+        posterior = jit_once(inference.posterior)(
             state.encoder_params, first, jnp.ones((TASKS, size)), GOALS[:, 0], jnp.ones(TASKS)
         )
         expected = posterior.variance.mean(-1)

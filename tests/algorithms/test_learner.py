@@ -202,7 +202,7 @@ def test_what_acts_is_the_average_of_the_steps_so_far(cmrl, ring):
 
 
 def test_a_policy_is_the_average_and_its_z_is_of_the_averaged_encoder(cmrl, ring):
-    params_of = make_policy_params(cmrl.learner)
+    params_of: Any = make_policy_params(cmrl.learner)
     averaged = spread(cmrl.state.averaged)
     run = SimpleNamespace(learner=replace(cmrl.state, averaged=averaged), context=ring)
     alone = replace(cmrl.state, averaged=None)

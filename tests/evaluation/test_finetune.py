@@ -350,7 +350,8 @@ def test_after_a_search_it_begins_where_the_winner_plays(restored, view):
     learner = session.algorithm.parts
     shape = learner.num_tasks, learner.inference.latent_dim
     task_z = np.random.default_rng(0).normal(size=shape).astype(np.float32)
-    params = PolicyParams(*trained.acting, trained.obs_stats, task_z)
+    actor, encoder = trained.acting
+    params = PolicyParams(actor, encoder, trained.obs_stats, task_z)
     agent = session.agent_of("arms")
     arm = 2 * len(session.env.symmetries[0]) + view
     shown = np.broadcast_to(text, (1, 1, len(placements), len(text)))

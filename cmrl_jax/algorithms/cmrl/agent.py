@@ -57,7 +57,8 @@ def make_policy_params(learner: Learner) -> Callable[[RunState], PolicyParams]:
     def policy_params(run: RunState) -> PolicyParams:
         state = run.learner
         task_z = None if inference is None else mean_z(state, run.context)
-        return PolicyParams(*state.acting, state.obs_stats, task_z)
+        actor, encoder = state.acting
+        return PolicyParams(actor, encoder, state.obs_stats, task_z)
 
     return policy_params
 
