@@ -149,28 +149,31 @@ def score(names: list[str]) -> int:
     """Makes the evaluations that are missing of the policies that are there."""
     for name in names:
         for evaluation in evaluations_of(name):
-            is_there = (SCORES / name / f"{evaluation}.json").exists()
-            if (POLICIES / name).exists() and not is_there:
-                print(f"== {name} {evaluation}", flush=True)
-                if code := score_once(name, evaluation):
-                    return code
+            if (POLICIES / name).exists() and (code := score_once(name, evaluation)):
+                return code
     return 0
 
 
 def finetune(names: list[str]) -> int:
     """Fine-tunes the first seed of every fold, where its run has ended and lies here."""
-    for name in (n for n in names if n.startswith("cmrl") and parts(n)[2] == 0):
+    for name in filter(is_finetuned, names):
         is_ended = (POLICIES / name).exists() and (RUNS / name / "ckpt").exists()
-        if is_ended and not (SCORES / name / f"{FINETUNE}.json").exists():
-            print(f"== {name} {FINETUNE}", flush=True)
-            if code := score_once(name, FINETUNE):
-                return code
+        if is_ended and (code := score_once(name, FINETUNE)):
+            return code
     return 0
 
 
+def is_finetuned(name: str) -> bool:
+    kind, _, seed = parts(name)
+    return kind == "cmrl" and seed == 0
+
+
 def score_once(name: str, evaluation: str) -> int:
-    """Makes one evaluation; its exit code."""
+    """Makes one evaluation, unless it is there; its exit code."""
     out = SCORES / name / f"{evaluation}.json"
+    if out.exists():
+        return 0
+    print(f"== {name} {evaluation}", flush=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     part, cells = out.with_suffix(".part.json"), out.with_suffix(".part.csv")
     for path in (part, cells):  # of a command that was stopped
@@ -255,8 +258,8 @@ def figures_of(name: str, evaluation: str, task: str) -> dict[int, dict[str, Any
     return {int(k): figures for k, figures in found.items()}
 
 
-def mean(arms: list[dict[str, Any]]) -> dict[str, float]:
-    return {x: sum(f[x] for f in arms) / len(arms) for x in FIGURES}
+def mean(figures: list[dict[str, Any]]) -> dict[str, float]:
+    return {x: sum(f[x] for f in figures) / len(figures) for x in FIGURES}
 
 
 def table(names: list[str]) -> int:
@@ -284,8 +287,8 @@ def by_episodes(rows: list[dict[str, Any]]) -> list[str]:
         for k in K:
             asked = {"fold": fold, "method": "cmrl", "protocol": "task", "k": k}
             found = [row for row in rows if asked.items() <= row.items()]
-            means = [sum(row[x] for row in found) / len(found) for x in FIGURES if found]
-            cells.append(f"{means[0]:.2f} ({means[1]:.2f})" if means else "")
+            text = "{success_any:.2f} ({success_last:.2f})"
+            cells.append(text.format(**mean(found)) if found else "")
         lines.append(f"| {fold} | {' | '.join(cells)} |")
     return lines
 
@@ -307,9 +310,9 @@ def markdown(rows: list[dict[str, Any]], protocol: str) -> list[str]:
             if not found:
                 cells.append("")
                 continue
-            means = [sum(r[x] for r in found) / len(found) for x in FIGURES]
-            worst = min(r["success_any"] for r in found)
-            cells.append(f"{means[0]:.2f} / {means[1]:.2f}, worst {worst:.2f} of {len(found)}")
+            means, worst = mean(found), min(r["success_any"] for r in found)
+            text = "{success_any:.2f} / {success_last:.2f}".format(**means)
+            cells.append(f"{text}, worst {worst:.2f} of {len(found)}")
         lines.append("| " + " | ".join([method, *cells]) + " |")
     return lines
 
@@ -411,8 +414,8 @@ def main(words: list[str]) -> int:
     if "--list" in words:
         for name in runs():
             print(f"python {shlex.join(train_command(name))}")
-            of_first = [FINETUNE] if name.startswith("cmrl") and name.endswith("-s0") else []
-            for evaluation in evaluations_of(name) + of_first:
+            tuned = [FINETUNE] if is_finetuned(name) else []
+            for evaluation in evaluations_of(name) + tuned:
                 print(f"python {shlex.join(score_command(name, evaluation))}")
         return 0
     step, chosen = words[:1], words[1:]
