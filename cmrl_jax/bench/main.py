@@ -80,10 +80,8 @@ def bench_learner(config: Config, report: Report) -> None:
     context = jax.jit(add)(run.context, jax.tree.map(lambda x: x[:, :, :writers], data))
 
     def updates(state, key):
-        def step(state, key):
-            return learner.update(state, replay, context, key)[0], None
-
-        return jax.lax.scan(step, state, jax.random.split(key, GRADIENT_STEPS))[0]
+        keys = jax.random.split(key, GRADIENT_STEPS)
+        return learner.updates(state, replay, context, keys)[0]
 
     compiled = jit_repeated(updates).lower(run.learner, jax.random.key(2)).compile()
     seconds = best_seconds(lambda: compiled(run.learner, jax.random.key(2)))

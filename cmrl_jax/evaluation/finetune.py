@@ -23,13 +23,14 @@ import numpy as np
 from cmrl_jax.algorithms.base import Told
 from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, make_policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
-from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
+from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.algorithms.cmrl.train_state import TrainState, pack, unpack
 from cmrl_jax.algorithms.common.replay import ReplayState, stored_transitions
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config
 from cmrl_jax.evaluation.episode import Episode, Lanes, make_episode
-from cmrl_jax.evaluation.finetune_options import FREE_Z, FinetuneOptions
+from cmrl_jax.evaluation.finetune_options import FREE_Z, PARTIAL, FinetuneOptions
 from cmrl_jax.jax_runtime import jit_once, jit_repeated
 from cmrl_jax.nn import normalizers
 from cmrl_jax.nn.context import Belief, ContextInference, init_belief, make_context_inference
@@ -153,16 +154,12 @@ def free_latent(latent_dim: int) -> ContextInference:
 
 
 def is_adapted(adapt: str, network: str, path: tuple[Any, ...]) -> bool:
-    """Whether gradient steps change a leaf of one of `_NETWORKS`."""
-    if adapt in ("all", "search", "scratch"):
-        return True
+    """Whether gradient steps of a way in `PARTIAL` change a leaf of one of `_NETWORKS`."""
     if adapt == "z":
         return network == "encoder_params"
-    if adapt == "router":
-        names = [str(getattr(key, "key", "")) for key in path]
-        is_router = any(name.startswith(ROUTER_PARTS) for name in names)
-        return is_router and network != "encoder_params"
-    return False  # posterior
+    names = [str(getattr(key, "key", "")) for key in path]
+    is_router = any(name.startswith(ROUTER_PARTS) for name in names)
+    return is_router and network != "encoder_params"
 
 
 class RestrictedLearner(Learner):
@@ -172,23 +169,31 @@ class RestrictedLearner(Learner):
         super().__init__(*args, **options)
         self.adapt = adapt
 
-    def update(
-        self, state: TrainState, replay_state: Any, context_state: Any, key: jax.Array
+    def step(
+        self,
+        flat: TrainState,
+        like: TrainState,
+        replay_state: Any,
+        context_state: Any,
+        key: jax.Array,
     ) -> tuple[TrainState, dict[str, jax.Array]]:
         """One gradient step; what it must not change is put back."""
         adapt = self.adapt
         if adapt == "posterior":
-            return state, {}
-        new, metrics = super().update(state, replay_state, context_state, key)
+            return flat, {}
+        new, metrics = super().step(flat, like, replay_state, context_state, key)
+        if adapt not in PARTIAL:
+            return new, metrics
+        moved, before = unpack(new, like), unpack(flat, like)
         kept = {
             name: jax.tree_util.tree_map_with_path(
                 lambda path, new, old, name=name: new if is_adapted(adapt, name, path) else old,
-                getattr(new, name),
-                getattr(state, name),
+                getattr(moved, name),
+                getattr(before, name),
             )
             for name in _NETWORKS
         }
-        return replace(new, **kept), metrics
+        return pack(replace(moved, **kept)), metrics
 
 
 def start_state(

@@ -13,7 +13,7 @@ from envs.goal_names import GOALS
 # `search`: all and z, after a search has found where to begin.
 ADAPT = ("posterior", "z", "router", "all", "search", "scratch")
 FREE_Z = ("z", "search")  # z is a parameter of its own, no encoder's output
-
+PARTIAL = ("z", "router")  # gradient steps leave parts of the networks as they are
 
 READ_OUTS = (0, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 

@@ -26,8 +26,9 @@ from learner_fixtures import (
 )
 
 from cmrl_jax.algorithms.cmrl.agent import make_policy_params
-from cmrl_jax.algorithms.cmrl.learner import Acting, Learner, per_task
+from cmrl_jax.algorithms.cmrl.learner import Learner, per_task
 from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch, routing_health
+from cmrl_jax.algorithms.cmrl.train_state import Acting
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.nn.distributions import sample_tanh_gaussian
@@ -289,7 +290,9 @@ def test_adam_on_the_flat_vector_equals_adam_on_the_tree():
     got: Any = params
     expected: Any = params
     for _ in range(3):
-        got, state, norm = adam_step(grads, state, got, 0.1, max_norm=0.0, stacked=True)
+        flat = [ravel(tree, stacked=True) for tree in (grads, got)]
+        new, state, norm = adam_step(flat[0], state, flat[1], 0.1, max_norm=0.0)
+        got = unravel(new, params)
         updates, plain = optax.adam(0.1).update(grads, plain)
         expected = optax.apply_updates(expected, updates)
     for name in params:

@@ -12,7 +12,8 @@ import numpy as np
 from flax import struct
 
 from cmrl_jax.algorithms.base import RunState, Told
-from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
+from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.algorithms.cmrl.train_state import TrainState
 from cmrl_jax.algorithms.common.replay import ReplayState, Transition, sample_transitions
 from cmrl_jax.nn.context import Belief, init_belief
 

@@ -18,8 +18,9 @@ import numpy as np
 from cmrl_jax import parallel
 from cmrl_jax.algorithms.base import RunState
 from cmrl_jax.algorithms.cmrl.diagnostics import make_diagnose
-from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
+from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.cmrl.rules import context_writers, lane_groups
+from cmrl_jax.algorithms.cmrl.train_state import TrainState
 from cmrl_jax.algorithms.common import replay as rings
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.algorithms.common.rollout import (
@@ -198,12 +199,8 @@ class TrainIteration:
     def _train_steps(self, run: RunState, key: jax.Array) -> tuple[RunState, dict[str, jax.Array]]:
         """The chunk's gradient steps; metrics are their means."""
         collect = self.config.collect
-
-        def step(state: TrainState, key: jax.Array):
-            return self.learner.update(state, run.replay, run.context, key)
-
         keys = jax.random.split(key, collect.chunk * collect.updates_per_vector_step)
-        state, metrics = jax.lax.scan(step, run.learner, keys)
+        state, metrics = self.learner.updates(run.learner, run.replay, run.context, keys)
         mean = {name: jnp.nanmean(value, 0) for name, value in metrics.items()}
         return run.replace(learner=state), mean
 

@@ -13,7 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cmrl_jax.algorithms.cmrl.learner import Learner, TrainState
+from cmrl_jax.algorithms.cmrl.learner import Learner
+from cmrl_jax.algorithms.cmrl.train_state import TrainState
 from cmrl_jax.algorithms.common import replay as rings
 from cmrl_jax.config.schema import Config
 from cmrl_jax.nn.optimizers import ravel

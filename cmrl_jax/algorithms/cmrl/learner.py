@@ -1,4 +1,4 @@
-"""The learner: its state, and one gradient step as a pure function, which the caller scans.
+"""The learner: gradient steps as pure functions.
 
 Order of a step (as in oyster): critics and encoder, actor, temperature, target networks;
 then the average that acts.
@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 
 from cmrl_jax import parallel
 from cmrl_jax.algorithms.cmrl.objectives import (
@@ -24,59 +23,14 @@ from cmrl_jax.algorithms.cmrl.objectives import (
     Minibatch,
     Objectives,
 )
+from cmrl_jax.algorithms.cmrl.train_state import STACKED, Acting, TrainState, pack, unpack
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.config.schema import Config, lanes_per_task
 from cmrl_jax.nn import normalizers
 from cmrl_jax.nn.context import ContextInference, context_mask, make_context_inference
 from cmrl_jax.nn.distributions import sample_tanh_gaussian
 from cmrl_jax.nn.networks import Params, Routing, make_networks
-from cmrl_jax.nn.optimizers import adam_step, init_adam, polyak
-
-
-class Acting(NamedTuple):
-    """The parameters that act outside training's own episodes."""
-
-    actor: Params
-    encoder: Params | None
-
-
-@struct.dataclass
-class TrainState:
-    """Everything that is learned or counted; a field that the configuration lacks is None.
-
-    Attributes:
-        critic_params, target_critic_params: leading axis 2 on every leaf, the twin critics.
-        value_params, target_value_params: the V network of `sac.variant: v`.
-        encoder_params: None unless `model.conditioning` is z.
-        averaged: actor and encoder, averaged over gradient steps (`sac.policy_average`).
-        log_alpha: log temperature of every training task, (T,).
-        obs_stats, return_stats: running statistics (normalizers.py), updated by collection.
-        gradient_steps: gradient steps applied, int32; exact below 2^31, where it stands still.
-        skipped_updates: gradient steps dropped for a non-finite gradient, int32.
-    """
-
-    actor_params: Params
-    critic_params: Params
-    target_critic_params: Params | None
-    value_params: Params | None
-    target_value_params: Params | None
-    encoder_params: Params | None
-    averaged: Acting | None
-    log_alpha: jax.Array
-    actor_opt_state: Any
-    critic_opt_state: Any
-    value_opt_state: Any
-    encoder_opt_state: Any
-    alpha_opt_state: Any
-    obs_stats: Any
-    return_stats: Any
-    gradient_steps: jax.Array
-    skipped_updates: jax.Array
-
-    @property
-    def acting(self) -> Acting:
-        """What acts in evaluation, and what a policy checkpoint holds."""
-        return self.averaged or Acting(self.actor_params, self.encoder_params)
+from cmrl_jax.nn.optimizers import adam_step, init_adam, polyak, ravel, unravel
 
 
 def per_task(rows: jax.Array, task_ids: jax.Array, num_tasks: int) -> jax.Array:
@@ -274,11 +228,36 @@ class Learner:
             The state after it, or the old one where a gradient was not finite; and metrics,
             float32, () or (T,): with `sac.task_rows` a task that was not drawn has NaN.
         """
+        flat, metrics = self.step(pack(state), state, replay_state, context_state, key)
+        return unpack(flat, state), metrics
+
+    def updates(
+        self, state: TrainState, replay_state: Any, context_state: Any, keys: jax.Array
+    ) -> tuple[TrainState, Metrics]:
+        """A gradient step for every key (step,); metrics as of `update`, leading axis step."""
+
+        def step(flat: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+            return self.step(flat, state, replay_state, context_state, key)
+
+        flat, metrics = jax.lax.scan(step, pack(state), keys)
+        return unpack(flat, state), metrics
+
+    def step(
+        self,
+        flat: TrainState,
+        like: TrainState,
+        replay_state: Any,
+        context_state: Any,
+        key: jax.Array,
+    ) -> tuple[TrainState, Metrics]:
+        """`update` on a packed state; `like` is any unpacked one."""
         sac = self.config.sac
+        state = unpack(flat, like)
         data = self.draw_minibatch(state, replay_state, context_state, key)
         norms: Metrics = {}
-        new, zc, critic_metrics = self._critic_step(state, data, norms)
-        new, log_prob, actor_metrics = self._actor_step(new, zc, data, norms)
+        new, zc, critic_metrics = self._critic_step(flat, state, data, norms)
+        critics = unravel(new.critic_params, state.critic_params)
+        new, log_prob, actor_metrics = self._actor_step(new, state, critics, zc, data, norms)
         new = self._averaging_step(self._target_step(new))
         if sac.alpha != "fixed":
             grad = jax.grad(self.objectives.alpha)(state.log_alpha, log_prob, data.task_ids)
@@ -289,7 +268,9 @@ class Learner:
 
         new = replace(new, gradient_steps=optax.safe_increment(state.gradient_steps))
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(norm)) for norm in norms.values()]))
-        new = jax.lax.cond(finite, lambda: new, lambda: state)
+        # What no step changes is the same array in both.
+        choose = lambda new, old: old if new is old else jnp.where(finite, new, old)
+        new = jax.tree.map(choose, new, flat)
         skipped = 1 - finite.astype(jnp.int32)
         new = replace(new, skipped_updates=state.skipped_updates + skipped)
 
@@ -303,14 +284,21 @@ class Learner:
         metrics |= {"alpha": jnp.exp(state.log_alpha), "skipped": skipped.astype(jnp.float32)}
         return new, metrics
 
-    def _adam(self, grads: Any, opt_state: Any, params: Params, stacked: bool = False) -> Any:
+    def _adam(self, flat: TrainState, network: str, grads: Any, norms: Metrics) -> TrainState:
+        """Adam's step of one network in a packed state, from the gradient's tree."""
+        params, moments = f"{network}_params", f"{network}_opt_state"
         sac = self.config.sac
-        return adam_step(
-            grads, opt_state, params, lr=sac.lr, max_norm=sac.grad_clip, stacked=stacked
+        new, opt_state, norms[network] = adam_step(
+            ravel(grads, stacked=params in STACKED),
+            getattr(flat, moments),
+            getattr(flat, params),
+            lr=sac.lr,
+            max_norm=sac.grad_clip,
         )
+        return replace(flat, **{params: new, moments: opt_state})
 
     def _critic_step(
-        self, state: TrainState, data: Minibatch, norms: Metrics
+        self, flat: TrainState, state: TrainState, data: Minibatch, norms: Metrics
     ) -> tuple[TrainState, jax.Array, Metrics]:
         """Critics and encoder; also the conditioning zc (task, conditioning) that they saw."""
         trained = CriticSide(state.critic_params, state.encoder_params)
@@ -318,35 +306,29 @@ class Learner:
         grads, (zc, metrics) = jax.grad(self.objectives.critic, has_aux=True)(
             trained, state.actor_params, target, state.log_alpha, data
         )
-        params, opt_state, norms["critic"] = self._adam(
-            grads.critic, state.critic_opt_state, state.critic_params, stacked=True
-        )
-        new = replace(state, critic_params=params, critic_opt_state=opt_state)
+        flat = self._adam(flat, "critic", grads.critic, norms)
         if self.has_encoder:
-            params, opt_state, norms["encoder"] = self._adam(
-                grads.encoder, state.encoder_opt_state, state.encoder_params
-            )
-            new = replace(new, encoder_params=params, encoder_opt_state=opt_state)
-        return new, zc, metrics
+            flat = self._adam(flat, "encoder", grads.encoder, norms)
+        return flat, zc, metrics
 
     def _actor_step(
-        self, state: TrainState, zc: jax.Array, data: Minibatch, norms: Metrics
+        self,
+        flat: TrainState,
+        state: TrainState,
+        critic_params: Params,
+        zc: jax.Array,
+        data: Minibatch,
+        norms: Metrics,
     ) -> tuple[TrainState, jax.Array, Metrics]:
         """Actor and V network, by the critics just trained; also log pi (task, batch)."""
         trained = ActorSide(state.actor_params, state.value_params)
         grads, (log_prob, metrics) = jax.grad(self.objectives.actor, has_aux=True)(
-            trained, state.critic_params, zc, state.log_alpha, data
+            trained, critic_params, zc, state.log_alpha, data
         )
-        params, opt_state, norms["actor"] = self._adam(
-            grads.actor, state.actor_opt_state, state.actor_params
-        )
-        new = replace(state, actor_params=params, actor_opt_state=opt_state)
+        flat = self._adam(flat, "actor", grads.actor, norms)
         if self.has_value:
-            params, opt_state, norms["value"] = self._adam(
-                grads.value, state.value_opt_state, state.value_params
-            )
-            new = replace(new, value_params=params, value_opt_state=opt_state)
-        return new, log_prob, metrics
+            flat = self._adam(flat, "value", grads.value, norms)
+        return flat, log_prob, metrics
 
     def _target_step(self, state: TrainState) -> TrainState:
         tau = self.config.sac.tau
