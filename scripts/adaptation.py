@@ -32,7 +32,7 @@ from cmrl_jax.cli.main import main as main_of_train  # noqa: E402
 from cmrl_jax.config.schema import ConfigError  # noqa: E402
 from cmrl_jax.evaluation.statistics import seeds_interval  # noqa: E402
 from cmrl_jax.storage.documents import read_json  # noqa: E402
-from cmrl_jax.storage.manifest import write_manifest  # noqa: E402
+from cmrl_jax.storage.packed import pack  # noqa: E402
 from cmrl_jax.storage.run_files import EVALUATION  # noqa: E402
 from scripts.experiments import refused  # noqa: E402
 
@@ -122,10 +122,7 @@ def keep(name: str) -> None:
     run, kept = RUNS / name, POLICIES / name
     last = max(int(path.name) for path in (run / "policy").iterdir() if path.name.isdigit())
     shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(run / "policy" / str(last), kept / "policy" / str(last))
-    for mark in kept.rglob("commit_success.txt"):  # in which orbax says where on its machine
-        mark.write_text("Checkpoint commit was successful\n", encoding="utf-8")
-    write_manifest(kept / "policy" / str(last))
+    pack(run / "policy" / str(last), kept / "policy" / f"{last}.zip")
     for file in ("config.yaml", "versions.json"):
         shutil.copy(run / file, kept / file)
     spoken = f"python {shlex.join(train_command(name)).removesuffix(' --resume')}\n"

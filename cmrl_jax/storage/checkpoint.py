@@ -13,6 +13,7 @@ import logging
 import os
 import re
 import sys
+import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,6 +27,7 @@ from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.storage.manifest import find_damage, fingerprint, is_listed, write_manifest
 from cmrl_jax.storage.named_arrays import describe, flatten, not_finite, placed, unflatten
 from cmrl_jax.storage.older_forms import as_stored, brought_up
+from cmrl_jax.storage.packed import packed_fingerprint, packed_steps, unpack
 from cmrl_jax.streams import to_stderr
 
 FULL_ITEMS = ("learner", "replay", "context")
@@ -58,13 +60,21 @@ class CheckpointStore:
         items: tuple[str, ...],
         keep: int | None = None,
         read_only: bool = False,
+        lies_in: tempfile.TemporaryDirectory[str] | None = None,
     ):
         """Open a store; the functions `full_store` and `policy_store` name the two of a run.
+
+        Args:
+            lies_in: where the checkpoints really are, removed when the store is closed; messages
+                speak of `directory`.
 
         Raises:
             ConfigError: the directory cannot be made.
         """
-        self.directory = directory.absolute()  # orbax refuses relative paths
+        self.name = directory.absolute()
+        self._lies_in = lies_in
+        # Orbax refuses relative paths.
+        self.directory = Path(lies_in.name).absolute() if lies_in else self.name
         self.items = items
         self.keep = keep
         if not read_only:
@@ -116,7 +126,7 @@ class CheckpointStore:
         for name, leaves in flat.items():
             if bad := not_finite(leaves):
                 cause = f"iteration {step} is not saved: {name}/{bad} is not finite"
-                cure = f"start a new run with a lower sac.lr; {self.directory} keeps the one before"
+                cure = f"start a new run with a lower sac.lr; {self.name} keeps the one before"
                 raise ConfigError(cause, cure)
         args: dict[str, Any] = {
             name: ocp.args.StandardSave(leaves) for name, leaves in flat.items() if leaves
@@ -171,11 +181,11 @@ class CheckpointStore:
         if reason := find_damage(self.directory / str(step)):
             raise self._damaged(step, reason)
         meta = self.read_meta(step)
-        check_origin(meta["config"], self.directory.parent)
+        check_origin(meta["config"], self.name.parent)
         if config is not None:
-            check_resumable(meta["config"], config, self.directory.parent)
+            check_resumable(meta["config"], config, self.name.parent)
         if versions is not None:
-            _warn_of_versions(self.directory / str(step), meta["versions"], versions)
+            _warn_of_versions(self.name / str(step), meta["versions"], versions)
         wanted = {name: flatten(abstract[name]) for name in self.items}
         args = {
             name: ocp.args.StandardRestore({path: placed(leaf) for path, leaf in leaves.items()})
@@ -213,7 +223,7 @@ class CheckpointStore:
             self._prune()  # what a kill left of a step that was being deleted
             return found
         if not bad:
-            raise _nothing_saved(self.directory)
+            raise _nothing_saved(self.name)
         cure = f"put {self.directory} back from a copy, or start a new run"
         raise DamagedCheckpoint(bad[0][1].cause, cure)
 
@@ -238,6 +248,8 @@ class CheckpointStore:
 
     def close(self) -> None:
         self._manager.close()
+        if self._lies_in is not None:
+            self._lies_in.cleanup()
 
     def __enter__(self) -> CheckpointStore:
         return self
@@ -248,12 +260,12 @@ class CheckpointStore:
     def _choose(self, step: int | None) -> int:
         steps = self.steps()
         if not steps:
-            raise _nothing_saved(self.directory)
+            raise _nothing_saved(self.name)
         if step is None:
             return steps[-1]
         if step not in steps:
             there = ", ".join(map(str, steps))
-            raise ConfigError(f"no checkpoint {step} in {self.directory}", f"there are: {there}")
+            raise ConfigError(f"no checkpoint {step} in {self.name}", f"there are: {there}")
         return step
 
     def _read(self, step: int, args: Mapping[str, Any]) -> Any:
@@ -267,7 +279,7 @@ class CheckpointStore:
             raise self._damaged(step, f"{type(error).__name__}: {error}") from error
 
     def _damaged(self, step: int, reason: str) -> DamagedCheckpoint:
-        path = self.directory / str(step)
+        path = self.name / str(step)
         older = [other for other in self.steps() if other < step]
         cure = "start a new run"
         if older and self.items == POLICY_ITEMS:
@@ -301,8 +313,9 @@ class CheckpointStore:
                 old = describe(saved[name]) if name in saved else "absent"
                 new = describe(leaves[name]) if name in leaves else "absent"
                 if old != new:
+                    place = self.name / str(step) / item
                     raise ConfigError(
-                        f"checkpoint {path} does not fit: {name} is {old} there, {new} here",
+                        f"checkpoint {place} does not fit: {name} is {old} there, {new} here",
                         "use the configuration and version that wrote it (versions.json)",
                     )
         return stored
@@ -314,13 +327,31 @@ def full_store(run: Path, keep: int | None = None, read_only: bool = False) -> C
 
 
 def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
-    """`DIR/policy`: what acting needs (actor, encoder, observation statistics, goals); all kept."""
-    return CheckpointStore(run / "policy", POLICY_ITEMS, None, read_only)
+    """`DIR/policy`: what acting needs (actor, encoder, observation statistics, goals); all kept.
+
+    To be read, they may all be packed (packed.py).
+
+    Raises:
+        ConfigError: a packed one is damaged.
+    """
+    directory = run / "policy"
+    packed = packed_steps(directory) if read_only else {}
+    if not packed:
+        return CheckpointStore(directory, POLICY_ITEMS, None, read_only)
+    lies_in = tempfile.TemporaryDirectory()
+    for step, file in packed.items():
+        if reason := unpack(file, Path(lies_in.name) / str(step)):
+            lies_in.cleanup()
+            raise DamagedCheckpoint(f"{file} is damaged: {reason}", "put it back from a copy")
+    return CheckpointStore(directory, POLICY_ITEMS, None, read_only, lies_in)
 
 
 def policy_digest(run: Path, step: int) -> str:
     """What tells a policy checkpoint from another of its name."""
-    return fingerprint(run / "policy" / str(step))
+    directory = run / "policy"
+    if file := packed_steps(directory).get(step):
+        return packed_fingerprint(file)
+    return fingerprint(directory / str(step))
 
 
 def split_run(run: Any) -> dict[str, Any]:
