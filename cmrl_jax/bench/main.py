@@ -3,7 +3,7 @@
 Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench/physics.py` and
 `bench/stages.py`; here are the learner (gradient steps) and the start (seconds from the command to
 the end of the first iteration, with an empty and a filled compilation cache, and peak memory), both
-of the main job.
+of the main job. What a GPU would be asked to start is counted in `bench/launches.py`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from cmrl_jax.algorithms.common.replay import Transition, add
 from cmrl_jax.bench import physics as bench_physics
 from cmrl_jax.bench import stages as bench_stages
+from cmrl_jax.bench.launches import bench_launches
 from cmrl_jax.bench.physics import best_seconds
 from cmrl_jax.commands import CHILD
 from cmrl_jax.config.files import load_config
@@ -137,6 +138,7 @@ KINDS = {
     "metaworld_vector": lambda config, report: bench_physics.bench_metaworld_vector(report),
     "learner": bench_learner,
     "start": bench_start,
+    "launches": bench_launches,
     "naive": lambda config, report: bench_physics.bench_naive(report),
 }
 

@@ -1,0 +1,98 @@
+"""Kernels of a compiled program, counted from its text; the text is that of the CPU's compiler."""
+
+import importlib.util
+import json
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+import pytest
+
+from cmrl_jax.bench import launches
+from cmrl_jax.bench.launches import Launches, bench_launches, count_launches
+from cmrl_jax.bench.main import Report
+from cmrl_jax.config.schema import Config
+
+
+def count(function, *args):
+    return count_launches(jax.jit(function).lower(*args).compile().as_text()).kernels
+
+
+X = jnp.arange(6.0).reshape(2, 3)
+square = lambda x: jnp.tanh(x @ x.T) @ x  # more than one kernel
+
+
+def loop(outer, inner):
+    def body(_, x):
+        return jax.lax.fori_loop(0, inner, lambda _, x: square(x), jnp.sin(x))
+
+    return lambda x: jax.lax.fori_loop(0, outer, body, x)
+
+
+def test_a_loop_counts_its_body_as_often_as_it_runs():
+    counts = {(m, n): count(loop(m, n), X) for m in (50, 60) for n in (30, 40)}
+    inner = (counts[50, 40] - counts[50, 30]) / (50 * 10)
+    assert inner >= 3 and inner == int(inner)
+    assert counts[60, 40] - counts[60, 30] == 60 * 10 * inner
+    outer = (counts[60, 30] - counts[50, 30]) / 10 - 30 * inner
+    assert outer >= 1 and outer == int(outer)
+
+
+def test_a_loop_that_may_end_early_counts_once():
+    def search(x):
+        return jax.lax.while_loop(lambda x: jnp.sum(x) < 100.0, square, x)
+
+    assert count(square, X) <= count(search, X) <= 3 * count(square, X)
+
+
+def test_of_branches_the_costliest_counts():
+    long = lambda x: square(square(square(x)))
+
+    def either(first, second):
+        branch = lambda x: jax.lax.cond(x[0, 0] > 0, first, second, x)
+        return count(branch, X)
+
+    assert either(long, square) == either(square, long) > either(square, square)
+    index = lambda i, x: jax.lax.switch(i, [square, long, square], x)
+    assert count(index, 1, X) >= count(long, X)
+
+
+def test_copies_are_counted_apart():
+    text = """
+ENTRY %main (x: f32[2]) -> f32[2] {
+  %x = f32[2]{0} parameter(0)
+  %copy.1 = f32[2]{0} copy(%x)
+  ROOT %fusion = f32[2]{0} fusion(%copy.1), kind=kLoop, calls=%fused
+}
+"""
+    assert count_launches(text) == Launches(kernels=2, copies=1)
+
+
+def test_without_the_wheels_one_line_says_how(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    bench_launches(Config(), Report(tmp_path / "bench.json", "cpu"))
+    [line] = capsys.readouterr().out.splitlines()
+    assert f"jax-cuda13-plugin=={jaxlib.__version__}" in line
+    assert not (tmp_path / "bench.json").exists()
+
+
+def test_a_program_that_does_not_compile_leaves_the_others_their_rows(tmp_path, capfd, monkeypatch):
+    """Without a plugin no program compiles: each is named, and the bench goes on."""
+    if importlib.util.find_spec("jax_cuda13_plugin"):
+        pytest.skip("the plugin is installed")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(launches, "PROGRAMS", ("nonsense",))
+    bench_launches(Config(), Report(tmp_path / "bench.json", "cpu"))
+    assert "launches: nonsense could not be compiled" in capfd.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_gradient_step_of_the_main_job_is_counted(tmp_path, monkeypatch):
+    if importlib.util.find_spec("jax_cuda13_plugin") is None:
+        pytest.skip("needs the wheels that bench_launches names")
+    monkeypatch.setattr(launches, "PROGRAMS", ("gradient_step",))
+    bench_launches(Config(), Report(tmp_path / "bench.json", "cpu"))
+    rows = {
+        x["name"]: x["value"] for x in json.loads((tmp_path / "bench.json").read_text())["rows"]
+    }
+    assert 50 < rows["launches/gradient_step"] < 400
