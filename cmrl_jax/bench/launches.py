@@ -8,6 +8,7 @@ there. Needed are jax's two CUDA wheels and none of NVIDIA's libraries (`HOW`).
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -22,7 +23,8 @@ from cmrl_jax.bench.physics import Report
 from cmrl_jax.config.schema import Config
 
 HOW = (
-    "python -m pip install --no-deps jax-cuda13-plugin=={0} jax-cuda13-pjrt=={0}; no GPU is needed"
+    "python -m pip install --no-deps jax-cuda13-plugin=={0} jax-cuda13-pjrt=={0}; then, without a "
+    "GPU, JAX_PLATFORMS=cpu JAX_SKIP_CUDA_CONSTRAINTS_CHECK=1 python train.py bench --rows launches"
 )
 PROGRAMS = ("gradient_step", "vector_step")
 GRADIENT_STEPS, CONTROL_STEPS, LANES = 100, 20, 2048
@@ -111,9 +113,8 @@ def count_launches(text: str) -> Launches:
 def bench_launches(config: Config, report: Report) -> None:
     """Rows `launches/` of the main job's learner and physics; without wheels, how to get them."""
     if importlib.util.find_spec("jax_cuda13_plugin") is None:
-        import jaxlib
-
-        print(f"launches: not counted, for want of {HOW.format(jaxlib.__version__)}", flush=True)
+        how = HOW.format(importlib.metadata.version("jaxlib"))
+        print(f"launches: not counted, for want of {how}", flush=True)
         return
     for name in PROGRAMS:
         command = [sys.executable, "-m", "cmrl_jax.bench.launches", name]
@@ -178,7 +179,7 @@ def compile_for_gpu(name: str) -> dict[str, float]:
         jax.jit(function).trace(*jax.tree.map(placed, shapes)).lower(lowering_platforms=("cuda",))
     )
     started = time.perf_counter()
-    found = count_launches(lowered.compile().as_text())
+    found = count_launches(lowered.compile().as_text() or "")
     seconds = time.perf_counter() - started
     return {
         "kernels": found.kernels / steps,

@@ -1,11 +1,11 @@
 """Kernels of a compiled program, counted from its text; the text is that of the CPU's compiler."""
 
+import importlib.metadata
 import importlib.util
 import json
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import pytest
 
 from cmrl_jax.bench import launches
@@ -15,7 +15,7 @@ from cmrl_jax.config.schema import Config
 
 
 def count(function, *args):
-    return count_launches(jax.jit(function).lower(*args).compile().as_text()).kernels
+    return count_launches(jax.jit(function).lower(*args).compile().as_text() or "").kernels
 
 
 X = jnp.arange(6.0).reshape(2, 3)
@@ -72,7 +72,7 @@ def test_without_the_wheels_one_line_says_how(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     bench_launches(Config(), Report(tmp_path / "bench.json", "cpu"))
     [line] = capsys.readouterr().out.splitlines()
-    assert f"jax-cuda13-plugin=={jaxlib.__version__}" in line
+    assert f"jax-cuda13-plugin=={importlib.metadata.version('jaxlib')}" in line
     assert not (tmp_path / "bench.json").exists()
 
 
