@@ -19,8 +19,15 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+from jax.experimental import topologies
+
 from cmrl_jax.bench.physics import Report
-from cmrl_jax.config.schema import Config
+from cmrl_jax.config.files import load_config
+from cmrl_jax.config.schema import ConfigError, require
+from cmrl_jax.evaluation.session import Session, prepare_jax
+from cmrl_jax.streams import to_stderr
 
 HOW = (
     "python -m pip install --no-deps jax-cuda13-plugin=={0} jax-cuda13-pjrt=={0}; then, without a "
@@ -110,20 +117,33 @@ def count_launches(text: str) -> Launches:
     return of_computation(entry)
 
 
-def bench_launches(config: Config, report: Report) -> None:
-    """Rows `launches/` of the main job's learner and physics; without wheels, how to get them."""
-    if importlib.util.find_spec("jax_cuda13_plugin") is None:
-        how = HOW.format(importlib.metadata.version("jaxlib"))
-        print(f"launches: not counted, for want of {how}", flush=True)
+def check_wheels() -> None:
+    """Raises ConfigError where the wheels are not installed."""
+    cause = "rows 'launches' need jax's CUDA wheels"
+    cure = HOW.format(importlib.metadata.version("jaxlib"))
+    require(importlib.util.find_spec("jax_cuda13_plugin") is not None, cause, cure)
+
+
+def bench_launches(config_file: str, report: Report) -> None:
+    """Rows `launches/` of a configuration's learner and of the physics; skipped without the wheels.
+
+    Raises:
+        ConfigError: a program does not compile.
+    """
+    try:
+        check_wheels()
+    except ConfigError as error:
+        to_stderr(f"skipped: {error.cause} ({error.cure})")
         return
     for name in PROGRAMS:
-        command = [sys.executable, "-m", "cmrl_jax.bench.launches", name]
+        command = [sys.executable, "-m", "cmrl_jax.bench.launches", name, config_file]
         # jax finds the plugin, and is not to look for a GPU.
         quiet = {"JAX_PLATFORMS": "cpu", "JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1"}
         run = subprocess.run(command, env=os.environ | quiet, stdout=subprocess.PIPE, text=True)
         if run.returncode:
-            print(f"launches: {name} could not be compiled (see above)", flush=True)
-            continue
+            cause = f"program '{name}' does not compile for the described GPU, as shown above"
+            cure = HOW.format(importlib.metadata.version("jaxlib"))
+            raise ConfigError(cause, f"take the wheels of jaxlib's own version: {cure}")
         row = json.loads(run.stdout.splitlines()[-1])
         labels = {"device": "H100, described"} | ({"lanes": LANES} if name == "vector_step" else {})
         report.add(f"launches/{name}", row["kernels"], "1", **labels)
@@ -131,16 +151,9 @@ def bench_launches(config: Config, report: Report) -> None:
         report.add(f"launches/{name}_compile_s", row["compile_s"], "s", **labels)
 
 
-def program(name: str) -> tuple[Any, tuple[Any, ...], int]:
+def program(name: str, config_file: str) -> tuple[Any, tuple[Any, ...], int]:
     """A function, the shapes it is called with, and how many steps it makes."""
-    import jax
-    import jax.numpy as jnp
-
-    from cmrl_jax.bench.main import CONFIG
-    from cmrl_jax.config.files import load_config
-    from cmrl_jax.evaluation.session import Session, prepare_jax
-
-    config = load_config(CONFIG)
+    config = load_config(config_file)
     prepare_jax(config)
     session = Session(config)
     env, learner = session.env, session.algorithm.parts
@@ -159,16 +172,15 @@ def program(name: str) -> tuple[Any, tuple[Any, ...], int]:
 
     if name == "gradient_step":
         return gradient_steps, (jax.eval_shape(session.algorithm.init, key), key), GRADIENT_STEPS
+    if name != "vector_step":
+        raise ValueError(f"unknown program '{name}'")
     reset = lambda key: jax.vmap(env.reset)(jax.random.split(key, LANES), jnp.zeros(LANES, int))
     return control_steps, (jax.eval_shape(reset, key), key), CONTROL_STEPS
 
 
-def compile_for_gpu(name: str) -> dict[str, float]:
+def compile_for_gpu(name: str, config_file: str) -> dict[str, float]:
     """Kernels and copies a step, and the seconds that compiling took."""
-    import jax
-    from jax.experimental import topologies
-
-    function, shapes, steps = program(name)
+    function, shapes, steps = program(name, config_file)
     jax.config.update("jax_enable_compilation_cache", False)
     target = topologies.get_topology_desc(
         platform="cuda", topology_name="h100", topology="1x1x1", target_config=H100
@@ -189,4 +201,4 @@ def compile_for_gpu(name: str) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(compile_for_gpu(sys.argv[1])))
+    print(json.dumps(compile_for_gpu(*sys.argv[1:])))

@@ -1,9 +1,9 @@
-"""`train.py bench`: what this machine does a second, as JSON rows that are flushed one by one.
+"""`train.py bench`: figures of this machine, as JSON rows that are flushed one by one.
 
 Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench/physics.py` and
 `bench/stages.py`; here are the learner (gradient steps) and the start (seconds from the command to
 the end of the first iteration, with an empty and a filled compilation cache, and peak memory), both
-of the main job. What a GPU would be asked to start is counted in `bench/launches.py`.
+of the main job. `bench/launches.py` counts the kernels that a step starts on a GPU.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from cmrl_jax.algorithms.common.replay import Transition, add
 from cmrl_jax.bench import physics as bench_physics
 from cmrl_jax.bench import stages as bench_stages
-from cmrl_jax.bench.launches import bench_launches
+from cmrl_jax.bench.launches import bench_launches, check_wheels
 from cmrl_jax.bench.physics import best_seconds
 from cmrl_jax.commands import CHILD
 from cmrl_jax.config.files import load_config
@@ -138,7 +138,7 @@ KINDS = {
     "metaworld_vector": lambda config, report: bench_physics.bench_metaworld_vector(report),
     "learner": bench_learner,
     "start": bench_start,
-    "launches": bench_launches,
+    "launches": lambda config, report: bench_launches(CONFIG, report),
     "naive": lambda config, report: bench_physics.bench_naive(report),
 }
 
@@ -147,11 +147,13 @@ def main(json_path: Path, rows: tuple[str, ...]) -> int:
     """Measures the chosen kinds of rows (all by default); returns the exit code.
 
     Raises:
-        ConfigError: an unknown kind.
+        ConfigError: an unknown kind, or one that needs what is not installed.
     """
     for row in rows:
         if row not in KINDS:
             raise ConfigError(f"unknown rows '{row}'", f"choose from: {', '.join(KINDS)}")
+    if "launches" in rows:
+        check_wheels()
     config = load_config(CONFIG)
     report = Report(json_path, prepare_jax(config))
     for kind, measure in KINDS.items():

@@ -126,7 +126,7 @@ def _plot(words: list[str]) -> int:
 
 def bench_parser() -> argparse.ArgumentParser:
     """Flags of `bench`."""
-    text = "Measures physics, learner, start-up and memory on this machine."
+    text = "Measures physics, learner, start-up and memory here; counts kernels of a GPU."
     parser = parser_of("bench", text)
     parser.add_argument(
         "--rows", type=names, default=(), metavar="A,B", help="only rows of these kinds"

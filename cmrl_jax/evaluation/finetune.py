@@ -24,7 +24,7 @@ from cmrl_jax.algorithms.base import Told
 from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, make_policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
 from cmrl_jax.algorithms.cmrl.learner import Learner
-from cmrl_jax.algorithms.cmrl.train_state import TrainState, pack, unpack
+from cmrl_jax.algorithms.cmrl.train_state import PACKED, TrainState, pack, unpack
 from cmrl_jax.algorithms.common.replay import ReplayState, stored_transitions
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.rules import validate
@@ -41,14 +41,6 @@ from envs.turned import TurnedEnv
 
 ROUTER_PARTS = ("embedding", "gating", "routing")  # names in networks.SoftModularNet begin so
 FREE_LATENT = "z"
-_NETWORKS = (
-    "actor_params",
-    "critic_params",
-    "target_critic_params",
-    "value_params",
-    "target_value_params",
-    "encoder_params",
-)
 
 
 class Score(NamedTuple):
@@ -154,7 +146,7 @@ def free_latent(latent_dim: int) -> ContextInference:
 
 
 def is_adapted(adapt: str, network: str, path: tuple[Any, ...]) -> bool:
-    """Whether gradient steps of a way in `PARTIAL` change a leaf of one of `_NETWORKS`."""
+    """Whether gradient steps of a way in `PARTIAL` change a leaf of one of `PACKED`."""
     if adapt == "z":
         return network == "encoder_params"
     names = [str(getattr(key, "key", "")) for key in path]
@@ -191,7 +183,7 @@ class RestrictedLearner(Learner):
                 getattr(moved, name),
                 getattr(before, name),
             )
-            for name in _NETWORKS
+            for name in PACKED
         }
         return pack(replace(moved, **kept)), metrics
 
@@ -216,7 +208,7 @@ def start_state(
     """
     if adapt == "scratch":
         return jax.tree.map(jnp.copy, fresh)  # every leaf a buffer of its own, to be donated
-    kept = {name: getattr(trained, name) for name in _NETWORKS}
+    kept = {name: getattr(trained, name) for name in PACKED}
     kept["actor_params"], kept["encoder_params"] = trained.acting
     if adapt in FREE_Z:
         if z is None:

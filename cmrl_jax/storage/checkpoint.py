@@ -15,6 +15,7 @@ import re
 import sys
 import tempfile
 import warnings
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -60,22 +61,22 @@ class CheckpointStore:
         items: tuple[str, ...],
         keep: int | None = None,
         read_only: bool = False,
-        lies_in: tempfile.TemporaryDirectory[str] | None = None,
+        packed: Mapping[int, Path] | None = None,
     ):
         """Open a store; the functions `full_store` and `policy_store` name the two of a run.
 
         Args:
-            lies_in: where the checkpoints really are, removed when the store is closed; messages
-                speak of `directory`.
+            packed: its steps as files (packed.py), each unpacked when it is read.
 
         Raises:
             ConfigError: the directory cannot be made.
         """
-        self.name = directory.absolute()
-        self._lies_in = lies_in
-        # Orbax refuses relative paths.
-        self.directory = Path(lies_in.name).absolute() if lies_in else self.name
+        self.directory = directory.absolute()  # orbax refuses relative paths
         self.items = items
+        self._packed = packed or {}
+        self._unpacked = tempfile.TemporaryDirectory() if packed else None
+        # Where orbax finds the steps.
+        self._place = Path(self._unpacked.name) if self._unpacked else self.directory
         self.keep = keep
         if not read_only:
             try:
@@ -94,12 +95,12 @@ class CheckpointStore:
             enable_async_checkpointing=False,
         )
         self._manager = ocp.CheckpointManager(
-            self.directory, item_names=(*items, "meta"), options=options
+            self._place, item_names=(*items, "meta"), options=options
         )
 
     def steps(self) -> list[int]:
         """Iterations that can be restored, oldest first."""
-        return sorted(self._manager.all_steps())
+        return sorted(self._packed or self._manager.all_steps())
 
     def save(self, trees: Mapping[str, Any], meta: Mapping[str, Any]) -> bool:
         """Store the trees as step `meta["iteration"]`; False if that step is stored already.
@@ -126,7 +127,7 @@ class CheckpointStore:
         for name, leaves in flat.items():
             if bad := not_finite(leaves):
                 cause = f"iteration {step} is not saved: {name}/{bad} is not finite"
-                cure = f"start a new run with a lower sac.lr; {self.name} keeps the one before"
+                cure = f"start a new run with a lower sac.lr; {self.directory} keeps the one before"
                 raise ConfigError(cause, cure)
         args: dict[str, Any] = {
             name: ocp.args.StandardSave(leaves) for name, leaves in flat.items() if leaves
@@ -134,12 +135,12 @@ class CheckpointStore:
         args["meta"] = ocp.args.JsonSave(json.loads(json.dumps(meta)))
         try:
             self._manager.save(step, args=ocp.args.Composite(**args))
-            write_manifest(self.directory / str(step))
+            write_manifest(self._place / str(step))
             self._prune()
         except ValueError as error:  # what tensorstore makes of an error of the file system
             if code := re.search(r"os_error_code='(\d+)'", str(error)):
                 number = int(code[1])
-                path = str(self.directory / str(step))
+                path = str(self._place / str(step))
                 raise OSError(number, os.strerror(number), path) from error
             raise
         return True
@@ -178,14 +179,14 @@ class CheckpointStore:
                 `abstract`. Each names what and a cure.
         """
         step = self._choose(step)
-        if reason := find_damage(self.directory / str(step)):
+        if reason := find_damage(self._place / str(step)):
             raise self._damaged(step, reason)
         meta = self.read_meta(step)
-        check_origin(meta["config"], self.name.parent)
+        check_origin(meta["config"], self.directory.parent)
         if config is not None:
-            check_resumable(meta["config"], config, self.name.parent)
+            check_resumable(meta["config"], config, self.directory.parent)
         if versions is not None:
-            _warn_of_versions(self.name / str(step), meta["versions"], versions)
+            _warn_of_versions(self._shown(step), meta["versions"], versions)
         wanted = {name: flatten(abstract[name]) for name in self.items}
         args = {
             name: ocp.args.StandardRestore({path: placed(leaf) for path, leaf in leaves.items()})
@@ -218,12 +219,12 @@ class CheckpointStore:
                 kept = self._set_aside(damaged_step)
                 tail = f"; kept as {kept}, going on from {step}"
                 to_stderr(f"warning: {error.cause}{tail}")
-            if not is_listed(self.directory / str(step)):
-                write_manifest(self.directory / str(step))
+            if not is_listed(self._place / str(step)):
+                write_manifest(self._place / str(step))
             self._prune()  # what a kill left of a step that was being deleted
             return found
         if not bad:
-            raise _nothing_saved(self.name)
+            raise _nothing_saved(self.directory)
         cure = f"put {self.directory} back from a copy, or start a new run"
         raise DamagedCheckpoint(bad[0][1].cause, cure)
 
@@ -248,8 +249,8 @@ class CheckpointStore:
 
     def close(self) -> None:
         self._manager.close()
-        if self._lies_in is not None:
-            self._lies_in.cleanup()
+        if self._unpacked is not None:
+            self._unpacked.cleanup()
 
     def __enter__(self) -> CheckpointStore:
         return self
@@ -260,26 +261,42 @@ class CheckpointStore:
     def _choose(self, step: int | None) -> int:
         steps = self.steps()
         if not steps:
-            raise _nothing_saved(self.name)
+            raise _nothing_saved(self.directory)
         if step is None:
             return steps[-1]
         if step not in steps:
             there = ", ".join(map(str, steps))
-            raise ConfigError(f"no checkpoint {step} in {self.name}", f"there are: {there}")
+            raise ConfigError(f"no checkpoint {step} in {self.directory}", f"there are: {there}")
+        self._unpack(step)
         return step
+
+    def _unpack(self, step: int) -> None:
+        """Puts a packed step where orbax finds it."""
+        place = self._place / str(step)
+        if step not in self._packed or place.exists():
+            return
+        try:
+            unpack(self._packed[step], place)
+        except zipfile.BadZipFile as error:
+            raise self._damaged(step, str(error)) from error
+        self._manager.reload()
+
+    def _shown(self, step: int) -> Path:
+        """What a user knows a step by."""
+        return self._packed.get(step, self.directory / str(step))
 
     def _read(self, step: int, args: Mapping[str, Any]) -> Any:
         try:
             return self._manager.restore(step, args=ocp.args.Composite(**args))
         except Exception as error:  # orbax, tensorstore and json each have their own classes
-            path = self.directory / str(step)
+            path = self._place / str(step)
             is_sound = is_listed(path) and find_damage(path) is None
             if is_sound and isinstance(error, (MemoryError, OSError, jax.errors.JaxRuntimeError)):
                 raise  # of the machine, not of the checkpoint
             raise self._damaged(step, f"{type(error).__name__}: {error}") from error
 
     def _damaged(self, step: int, reason: str) -> DamagedCheckpoint:
-        path = self.name / str(step)
+        path = self._shown(step)
         older = [other for other in self.steps() if other < step]
         cure = "start a new run"
         if older and self.items == POLICY_ITEMS:
@@ -295,7 +312,7 @@ class CheckpointStore:
         """What to read for the arrays `wanted`; names the first one that the checkpoint lacks."""
         stored = {}
         for item, leaves in wanted.items():
-            path = self.directory / str(step) / item
+            path = self._place / str(step) / item
             saved = {}
             if path.exists():
                 try:
@@ -313,7 +330,7 @@ class CheckpointStore:
                 old = describe(saved[name]) if name in saved else "absent"
                 new = describe(leaves[name]) if name in leaves else "absent"
                 if old != new:
-                    place = self.name / str(step) / item
+                    place = self._shown(step) / item
                     raise ConfigError(
                         f"checkpoint {place} does not fit: {name} is {old} there, {new} here",
                         "use the configuration and version that wrote it (versions.json)",
@@ -330,28 +347,26 @@ def policy_store(run: Path, read_only: bool = False) -> CheckpointStore:
     """`DIR/policy`: what acting needs (actor, encoder, observation statistics, goals); all kept.
 
     To be read, they may all be packed (packed.py).
-
-    Raises:
-        ConfigError: a packed one is damaged.
     """
     directory = run / "policy"
-    packed = packed_steps(directory) if read_only else {}
-    if not packed:
-        return CheckpointStore(directory, POLICY_ITEMS, None, read_only)
-    lies_in = tempfile.TemporaryDirectory()
-    for step, file in packed.items():
-        if reason := unpack(file, Path(lies_in.name) / str(step)):
-            lies_in.cleanup()
-            raise DamagedCheckpoint(f"{file} is damaged: {reason}", "put it back from a copy")
-    return CheckpointStore(directory, POLICY_ITEMS, None, read_only, lies_in)
+    packed = packed_steps(directory) if read_only else None
+    return CheckpointStore(directory, POLICY_ITEMS, None, read_only, packed)
 
 
 def policy_digest(run: Path, step: int) -> str:
-    """What tells a policy checkpoint from another of its name."""
-    directory = run / "policy"
-    if file := packed_steps(directory).get(step):
+    """What tells a policy checkpoint from another of its name.
+
+    Raises:
+        ConfigError: it is packed, and damaged.
+    """
+    file = packed_steps(run / "policy").get(step)
+    if file is None:
+        return fingerprint(run / "policy" / str(step))
+    try:
         return packed_fingerprint(file)
-    return fingerprint(directory / str(step))
+    except zipfile.BadZipFile as error:
+        cure = "put it back from a copy"
+        raise DamagedCheckpoint(f"checkpoint {file} is damaged: {error}", cure) from error
 
 
 def split_run(run: Any) -> dict[str, Any]:

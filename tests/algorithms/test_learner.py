@@ -28,7 +28,7 @@ from learner_fixtures import (
 from cmrl_jax.algorithms.cmrl.agent import make_policy_params
 from cmrl_jax.algorithms.cmrl.learner import Learner, per_task
 from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch, routing_health
-from cmrl_jax.algorithms.cmrl.train_state import Acting
+from cmrl_jax.algorithms.cmrl.train_state import PACKED, STACKED, Acting, pack, unpack
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.nn.distributions import sample_tanh_gaussian
@@ -157,6 +157,22 @@ def test_update_keeps_the_structure_of_the_state(variant, ring):
         assert value.dtype == jnp.float32 and value.shape in ((), (TASKS,)), name
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_packed_state_holds_every_parameter_once_and_is_unpacked_again(variant):
+    learner = Learner(tiny_config(**VARIANTS[variant]), GOALS, OBS, ACT)
+    state = spread(jax.eval_shape(learner.init, jax.random.key(0)))
+    flat = pack(state)
+    for got, want in zip(*map(jax.tree.leaves, (unpack(flat, state), state)), strict=True):
+        np.testing.assert_array_equal(got, want)
+    for name in PACKED:
+        tree, vector = getattr(state, name), getattr(flat, name)
+        assert (tree is None) == (vector is None), name
+        if tree is not None:
+            assert vector.ndim == 1 + (name in STACKED) and vector.size == sum(
+                leaf.size for leaf in jax.tree.leaves(tree)
+            )
+
+
 @pytest.mark.parametrize("variant", ["cmrl", "c51", "pearl"])
 def test_one_step_moves_every_network_and_the_targets_by_tau(variant, ring, cmrl):
     cfg = tiny_config(**VARIANTS[variant])
@@ -262,7 +278,7 @@ def bootstrapping():
         moments = replace(moments, variance=variance)
         state = replace(state, return_stats=replace(state.return_stats, moments=moments))
         keys = jax.random.split(jax.random.key(1), 2000)
-        metrics = jax.lax.scan(lambda s, k: learner.update(s, ring, ring, k), state, keys)[1]
+        metrics = learner.updates(state, ring, ring, keys)[1]
         return jnp.mean(metrics["q_mean"][-100:], axis=0)  # (task,)
 
     return train

@@ -108,7 +108,7 @@ def train_and_evaluate():
         buffer = replay.add(buffer, episode(k_episode, policy_of(state, z, False)))
         rings = buffer, context
         keys = jax.random.split(k_update, UPDATES)
-        state, metrics = jax.lax.scan(lambda s, k: learner.update(s, *rings, k), state, keys)
+        state, metrics = learner.updates(state, *rings, keys)
         return (state, rings), jnp.sum(metrics["skipped"])
 
     @jax.jit

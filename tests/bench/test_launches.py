@@ -3,6 +3,7 @@
 import importlib.metadata
 import importlib.util
 import json
+import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,8 @@ import pytest
 
 from cmrl_jax.bench import launches
 from cmrl_jax.bench.launches import Launches, bench_launches, count_launches
-from cmrl_jax.bench.main import Report
-from cmrl_jax.config.schema import Config
+from cmrl_jax.bench.main import CONFIG, Report
+from cmrl_jax.config.schema import ConfigError
 
 
 def count(function, *args):
@@ -68,31 +69,34 @@ ENTRY %main (x: f32[2]) -> f32[2] {
     assert count_launches(text) == Launches(kernels=2, copies=1)
 
 
-def test_without_the_wheels_one_line_says_how(tmp_path, capsys, monkeypatch):
+def test_without_the_wheels_they_are_skipped_or_refused(tmp_path, capsys, monkeypatch, refused):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    bench_launches(Config(), Report(tmp_path / "bench.json", "cpu"))
-    [line] = capsys.readouterr().out.splitlines()
-    assert f"jax-cuda13-plugin=={importlib.metadata.version('jaxlib')}" in line
+    bench_launches(CONFIG, Report(tmp_path / "bench.json", "cpu"))
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith("skipped: rows 'launches' need jax's CUDA wheels")
+    cause, cure = refused("bench", "--rows", "launches", "--json", str(tmp_path / "bench.json"))
+    assert cause == "rows 'launches' need jax's CUDA wheels"
+    assert f"jax-cuda13-plugin=={importlib.metadata.version('jaxlib')}" in cure
     assert not (tmp_path / "bench.json").exists()
 
 
-def test_a_program_that_does_not_compile_leaves_the_others_their_rows(tmp_path, capfd, monkeypatch):
-    """Without a plugin no program compiles: each is named, and the bench goes on."""
-    if importlib.util.find_spec("jax_cuda13_plugin"):
-        pytest.skip("the plugin is installed")
+def test_a_program_that_does_not_compile_stops_it_and_leaves_the_rows(tmp_path, monkeypatch):
+    row = 'noise\n{"kernels": 9.5, "copies": 1, "compile_s": 3}\n'
+    answers = [subprocess.CompletedProcess((), 0, row), subprocess.CompletedProcess((), 1, "")]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(launches, "PROGRAMS", ("nonsense",))
-    bench_launches(Config(), Report(tmp_path / "bench.json", "cpu"))
-    assert "launches: nonsense could not be compiled" in capfd.readouterr().out
+    monkeypatch.setattr(subprocess, "run", lambda command, **options: answers.pop(0))
+    with pytest.raises(ConfigError, match="'vector_step' does not compile"):
+        bench_launches(CONFIG, Report(tmp_path / "bench.json", "cpu"))
+    rows = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    figures = {row["name"]: row["value"] for row in rows}
+    assert figures["launches/gradient_step"] == 9.5 and len(figures) == 3
 
 
 @pytest.mark.slow
 def test_a_gradient_step_of_the_main_job_is_counted(tmp_path, monkeypatch):
     if importlib.util.find_spec("jax_cuda13_plugin") is None:
-        pytest.skip("needs the wheels that bench_launches names")
+        pytest.skip("needs the wheels that check_wheels names")
     monkeypatch.setattr(launches, "PROGRAMS", ("gradient_step",))
-    bench_launches(Config(), Report(tmp_path / "bench.json", "cpu"))
-    rows = {
-        x["name"]: x["value"] for x in json.loads((tmp_path / "bench.json").read_text())["rows"]
-    }
-    assert 50 < rows["launches/gradient_step"] < 400
+    bench_launches(CONFIG, Report(tmp_path / "bench.json", "cpu"))
+    kernels, *_ = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    assert kernels["name"] == "launches/gradient_step" and 50 < kernels["value"] < 400

@@ -1,4 +1,4 @@
-"""Packed policies: the same arrays from one file, wherever it was packed; never wrong data."""
+"""Packed policies: the same arrays from one file, and never wrong ones."""
 
 import shutil
 import tempfile
@@ -9,7 +9,7 @@ from checkpoint_fixtures import assert_equal_trees, init_state, make_meta
 
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.storage import checkpoint, manifest
-from cmrl_jax.storage.packed import pack
+from cmrl_jax.storage.packed import pack, read_packed, unpack
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,12 @@ def read(run, step=None):
         return store.restore({"policy": init_state()}, step=step), store.steps()
 
 
+def refusal(run, step=None):
+    with pytest.raises(ConfigError) as raised:
+        read(run, step)
+    return raised.value.cause, raised.value.cure
+
+
 def test_a_packed_policy_is_the_policy(run, packed):
     for step in (3, 7, None):
         (found, meta), steps = read(packed, step)
@@ -44,23 +50,28 @@ def test_a_packed_policy_is_the_policy(run, packed):
     assert [path.name for path in sorted(packed.rglob("*")) if path.is_file()] == ["3.zip", "7.zip"]
 
 
-def test_it_is_one_file_wherever_it_is_packed(run, packed, tmp_path):
-    """Nothing in it says where it was: another place or machine gives the same bytes."""
+def test_copies_of_one_checkpoint_are_one_file_that_names_no_place(run, packed, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     shutil.copytree(run / "policy" / "7", elsewhere / "7")
     for mark in (elsewhere / "7").rglob("commit_success.txt"):
         mark.write_text(f"Checkpoint commit was successful to {mark.parent}")
+    manifest.write_manifest(elsewhere / "7")
     pack(elsewhere / "7", elsewhere / "7.zip")
     file = packed / "policy" / "7.zip"
     assert (elsewhere / "7.zip").read_bytes() == file.read_bytes()
-    with zipfile.ZipFile(file) as archive:
-        for name in archive.namelist():
-            assert str(run).encode() not in archive.read(name), name
+    assert not any(str(run).encode() in data for data in read_packed(file).values())
+
+
+def test_a_damaged_checkpoint_is_not_packed(run, tmp_path):
+    shutil.copytree(run / "policy" / "7", tmp_path / "7")
+    next((tmp_path / "7").rglob("_METADATA")).write_text("{}")
+    with pytest.raises(ConfigError, match="is damaged: .*_METADATA is not what was written"):
+        pack(tmp_path / "7", tmp_path / "7.zip")
+    assert not (tmp_path / "7.zip").exists()
 
 
 def test_its_digest_is_that_of_its_files(packed, tmp_path):
-    with zipfile.ZipFile(packed / "policy" / "7.zip") as archive:
-        archive.extractall(tmp_path / "files")
+    unpack(packed / "policy" / "7.zip", tmp_path / "files")
     digest = checkpoint.policy_digest(packed, 7)
     assert digest == manifest.fingerprint(tmp_path / "files")
     assert digest != checkpoint.policy_digest(packed, 3)
@@ -72,31 +83,52 @@ def test_a_folder_is_not_hidden_by_a_packed_one(run, packed):
     assert checkpoint.policy_digest(packed, 3) == checkpoint.policy_digest(run, 3)
 
 
-def test_what_was_unpacked_to_be_read_is_removed(packed, tmp_path, monkeypatch):
+def test_a_damaged_one_is_named_and_leaves_the_others(packed, tmp_path, monkeypatch):
+    """Nothing that was unpacked stays, either."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
-    read(packed)
-    (packed / "policy" / "7.zip").write_bytes(b"")
-    with pytest.raises(ConfigError):
-        read(packed)
+    file = packed / "policy" / "7.zip"
+    file.write_bytes(file.read_bytes()[:-30])
+    cause, cure = refusal(packed)
+    assert cause.startswith(f"checkpoint {file} is damaged: BadZipFile")
+    assert cure == "use an older one: --checkpoint 3"
+    with pytest.raises(ConfigError, match=r"7\.zip is damaged"):
+        checkpoint.policy_digest(packed, 7)
+    (found, _), steps = read(packed, 3)
+    assert steps == [3, 7]
+    assert_equal_trees(found["policy"], init_state(3))
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_damage_never_comes_back_as_data(packed):
+@pytest.mark.parametrize("name", ["/tmp/x", "../x", "a/../../x"])
+def test_what_lies_outside_or_was_not_packed_here_is_refused(packed, name):
     file = packed / "policy" / "7.zip"
-    sound, wanted = file.read_bytes(), read(packed)[0]
-    harms = [sound[: len(sound) // 2], b"", b"no archive"]
-    for place in range(0, len(sound), len(sound) // 30):
-        harms.append(sound[:place] + bytes([sound[place] ^ 4]) + sound[place + 1 :])
+    with zipfile.ZipFile(file, "a") as archive:
+        archive.writestr(name, "x")
+    assert "lies outside it" in refusal(packed)[0]
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("policy/d", "x")
+    assert "it has no sha256.txt" in refusal(packed)[0]
+
+
+def test_no_flipped_bit_comes_back_as_data(packed, tmp_path):
+    """Every byte of what says where the files are, and every hundredth of the files."""
+    file = packed / "policy" / "7.zip"
+    sound, wanted = file.read_bytes(), read_packed(file)
+    directory = sound.index(b"PK\x01\x02")
+    places = [*range(0, directory, 100), *range(directory, len(sound))]
     refused = 0
-    for harmed in harms:
-        file.write_bytes(harmed)
+    for n, place in enumerate(places):
+        flipped = sound[place] ^ (1 << n % 8)
+        file.write_bytes(sound[:place] + bytes([flipped]) + sound[place + 1 :])
         try:
-            found, meta = read(packed, 7)[0]
-        except ConfigError as error:
+            found = read_packed(file)
+        except zipfile.BadZipFile:
             refused += 1
-            assert "7" in error.cause and "\n" not in error.cause and error.cure
-        else:
-            assert meta == wanted[1]
-            assert_equal_trees(found, wanted[0])
-    assert refused > 25
+            continue
+        if found != wanted:
+            shutil.rmtree(tmp_path / "files", ignore_errors=True)
+            unpack(file, tmp_path / "files")
+            assert manifest.find_damage(tmp_path / "files"), place
+            refused += 1
+    assert refused > len(places) // 3

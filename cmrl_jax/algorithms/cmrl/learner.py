@@ -228,8 +228,8 @@ class Learner:
             The state after it, or the old one where a gradient was not finite; and metrics,
             float32, () or (T,): with `sac.task_rows` a task that was not drawn has NaN.
         """
-        flat, metrics = self.step(pack(state), state, replay_state, context_state, key)
-        return unpack(flat, state), metrics
+        state, metrics = self.updates(state, replay_state, context_state, key[None])
+        return state, {name: value[0] for name, value in metrics.items()}
 
     def updates(
         self, state: TrainState, replay_state: Any, context_state: Any, keys: jax.Array
@@ -250,7 +250,14 @@ class Learner:
         context_state: Any,
         key: jax.Array,
     ) -> tuple[TrainState, Metrics]:
-        """`update` on a packed state; `like` is any unpacked one."""
+        """One gradient step on a packed state (`train_state.pack`).
+
+        Args:
+            like: an unpacked state, of which only trees and shapes are read.
+
+        Returns:
+            The packed state after it, and metrics, as of `update`.
+        """
         sac = self.config.sac
         state = unpack(flat, like)
         data = self.draw_minibatch(state, replay_state, context_state, key)
@@ -330,24 +337,24 @@ class Learner:
             flat = self._adam(flat, "value", grads.value, norms)
         return flat, log_prob, metrics
 
-    def _target_step(self, state: TrainState) -> TrainState:
+    def _target_step(self, flat: TrainState) -> TrainState:
         tau = self.config.sac.tau
         if self.has_value:
-            target = polyak(state.value_params, state.target_value_params, tau)
-            return replace(state, target_value_params=target)
-        target = polyak(state.critic_params, state.target_critic_params, tau)
-        return replace(state, target_critic_params=target)
+            target = polyak(flat.value_params, flat.target_value_params, tau)
+            return replace(flat, target_value_params=target)
+        target = polyak(flat.critic_params, flat.target_critic_params, tau)
+        return replace(flat, target_critic_params=target)
 
-    def _averaging_step(self, state: TrainState) -> TrainState:
+    def _averaging_step(self, flat: TrainState) -> TrainState:
         """Polynomial-decay averaging (Shamir and Zhang 2013): the newest weighs 1 / (1 + share n).
 
         With a share of 0.1 the last tenth of the steps has two thirds of the weight. After n steps
         the mean age of what is averaged is n share / (1 + share), however long a run is; a fixed
         rate would have to be chosen for its length.
         """
-        if state.averaged is None:
-            return state
-        steps = state.gradient_steps.astype(jnp.float32)
+        if flat.averaged is None:
+            return flat
+        steps = flat.gradient_steps.astype(jnp.float32)
         rate = 1.0 / (1.0 + self.config.sac.policy_average * steps)
-        newest = Acting(state.actor_params, state.encoder_params)
-        return replace(state, averaged=polyak(newest, state.averaged, rate))
+        newest = Acting(flat.actor_params, flat.encoder_params)
+        return replace(flat, averaged=polyak(newest, flat.averaged, rate))

@@ -23,6 +23,9 @@ class Acting(NamedTuple):
 class TrainState:
     """Everything that is learned or counted; a field that the configuration lacks is None.
 
+    Packed, which it is inside the loop of gradient steps alone, it holds a vector in place of every
+    network's tree: see `pack`.
+
     Attributes:
         critic_params, target_critic_params: leading axis 2 on every leaf, the twin critics.
         value_params, target_value_params: the V network of `sac.variant: v`.
@@ -63,7 +66,10 @@ PACKED = ("actor_params", "value_params", "target_value_params", "encoder_params
 
 
 def pack(state: TrainState) -> TrainState:
-    """The state with every network's parameters as one vector, as gradient steps use them."""
+    """The state with each network of `PACKED` as one vector, as gradient steps use them.
+
+    (parameter,); (2, parameter) for those in `STACKED`. The two averages are packed likewise.
+    """
     flat = {name: ravel(getattr(state, name), stacked=name in STACKED) for name in PACKED}
     if state.averaged is not None:
         flat["averaged"] = Acting(*map(ravel, state.averaged))
@@ -71,7 +77,7 @@ def pack(state: TrainState) -> TrainState:
 
 
 def unpack(flat: TrainState, like: TrainState) -> TrainState:
-    """The inverse of `pack`, with the trees and shapes of `like`."""
+    """The inverse of `pack`; of `like`, an unpacked state, only trees and shapes are read."""
     trees = {name: unravel(getattr(flat, name), getattr(like, name)) for name in PACKED}
     if flat.averaged is not None and like.averaged is not None:
         trees["averaged"] = Acting(*map(unravel, flat.averaged, like.averaged))
