@@ -52,6 +52,7 @@ def run_unread(lines, *words):
 # Signals ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_closed_terminal_saves_and_ends_like_sigterm(tmp_path):
     """A terminal that closes sends SIGHUP more than once: the kernel does, and the shell."""
     run = tmp_path / "run"

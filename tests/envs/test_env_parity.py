@@ -48,6 +48,7 @@ def test_all_parts(compiled, tmp_path, capsys):
         assert list(task["closed_loop"]) == ["0", "0.3"]
 
 
+@pytest.mark.slow
 def test_policies_only_with_noise_and_seed(compiled, tmp_path, capsys, monkeypatch):
     asked = []
     load = parity.load_goal_set

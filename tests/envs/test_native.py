@@ -228,6 +228,7 @@ def test_two_training_iterations_are_finite_and_repeat():
     assert runs[0][1]["physics_faults"] == 0
 
 
+@pytest.mark.slow
 def test_a_native_run_is_scored_in_either_simulator(tmp_path):
     run, scores = tmp_path / "run", {}
     words = ["--config", "smoke.yaml", "--env.physics", "native", "--train.env_steps", "600"]
