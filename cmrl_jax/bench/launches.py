@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import topologies
 
-from cmrl_jax.bench.physics import Report
+from cmrl_jax.bench.physics import CONTROL_STEPS, Report, random_steps
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import ConfigError, require
 from cmrl_jax.evaluation.session import Session, prepare_jax
@@ -34,7 +34,7 @@ HOW = (
     "GPU, JAX_PLATFORMS=cpu JAX_SKIP_CUDA_CONSTRAINTS_CHECK=1 python train.py bench --rows launches"
 )
 PROGRAMS = ("gradient_step", "vector_step")
-GRADIENT_STEPS, CONTROL_STEPS, LANES = 100, 20, 2048
+GRADIENT_STEPS, LANES = 100, 2048
 
 # What XLA asks a device to be; of an "NVIDIA H100 80GB HBM3".
 H100 = """
@@ -163,19 +163,12 @@ def program(name: str, config_file: str) -> tuple[Any, tuple[Any, ...], int]:
         keys = jax.random.split(key, GRADIENT_STEPS)
         return learner.updates(run.learner, run.replay, run.context, keys)[0]
 
-    def control_steps(state: Any, key: Any) -> Any:
-        def step(state: Any, key: Any) -> Any:
-            action = jax.random.uniform(key, (LANES, env.action_size), minval=-1, maxval=1)
-            return jax.vmap(env.step)(state, action), None
-
-        return jax.lax.scan(step, state, jax.random.split(key, CONTROL_STEPS))[0]
-
     if name == "gradient_step":
         return gradient_steps, (jax.eval_shape(session.algorithm.init, key), key), GRADIENT_STEPS
     if name != "vector_step":
         raise ValueError(f"unknown program '{name}'")
     reset = lambda key: jax.vmap(env.reset)(jax.random.split(key, LANES), jnp.zeros(LANES, int))
-    return control_steps, (jax.eval_shape(reset, key), key), CONTROL_STEPS
+    return random_steps(env), (jax.eval_shape(reset, key), key), CONTROL_STEPS
 
 
 def compile_for_gpu(name: str, config_file: str) -> dict[str, float]:
@@ -191,8 +184,9 @@ def compile_for_gpu(name: str, config_file: str) -> dict[str, float]:
         jax.jit(function).trace(*jax.tree.map(placed, shapes)).lower(lowering_platforms=("cuda",))
     )
     started = time.perf_counter()
-    found = count_launches(lowered.compile().as_text() or "")
+    compiled = lowered.compile()
     seconds = time.perf_counter() - started
+    found = count_launches(compiled.as_text() or "")
     return {
         "kernels": found.kernels / steps,
         "copies": found.copies / steps,

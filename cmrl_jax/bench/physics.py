@@ -46,18 +46,25 @@ def best_seconds(run: Callable[[], Any], repeats: int = REPEATS) -> float:
     return min(seconds)
 
 
-def bench_backend(physics: str, lane_counts: tuple[int, ...], report: Report) -> None:
-    """Our environment, lanes of all four tasks mixed, by number of lanes."""
-    env = Ml4Env(physics=physics)
+def random_steps(env: Any) -> Callable[[Any, jax.Array], Any]:
+    """`CONTROL_STEPS` steps with random actions: (states of all lanes, key) -> states."""
 
-    def steps(state, key):
-        def step(state, key):
+    def steps(state: Any, key: jax.Array) -> Any:
+        def step(state: Any, key: jax.Array) -> tuple[Any, None]:
             action = jax.random.uniform(
                 key, (len(state.steps), env.action_size), minval=-1, maxval=1
             )
             return jax.vmap(env.step)(state, action), None
 
         return jax.lax.scan(step, state, jax.random.split(key, CONTROL_STEPS))[0]
+
+    return steps
+
+
+def bench_backend(physics: str, lane_counts: tuple[int, ...], report: Report) -> None:
+    """Our environment, lanes of all four tasks mixed, by number of lanes."""
+    env = Ml4Env(physics=physics)
+    steps = random_steps(env)
 
     for lanes in lane_counts:
         task = jnp.arange(lanes) % len(TASKS)

@@ -26,8 +26,13 @@ def is_listed(directory: Path) -> bool:
 def fingerprint(directory: Path) -> str:
     """Twelve digits that tell this content from other content: of the list there is or would be."""
     if is_listed(directory):
-        return _digest(directory / NAME)[:12]
-    return hashlib.sha256(_list_of(directory).encode()).hexdigest()[:12]
+        return fingerprint_of((directory / NAME).read_bytes())
+    return fingerprint_of(_list_of(directory).encode())
+
+
+def fingerprint_of(manifest: bytes) -> str:
+    """`fingerprint` of the content that a list names."""
+    return hashlib.sha256(manifest).hexdigest()[:12]
 
 
 def find_damage(directory: Path) -> str | None:

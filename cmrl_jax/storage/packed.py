@@ -6,7 +6,6 @@ packed policy has the same files less those places, so that copies of one checkp
 
 from __future__ import annotations
 
-import hashlib
 import io
 import shutil
 import tempfile
@@ -14,7 +13,7 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from cmrl_jax.config.schema import ConfigError
-from cmrl_jax.storage.manifest import NAME, find_damage, write_manifest
+from cmrl_jax.storage.manifest import NAME, find_damage, fingerprint_of, write_manifest
 
 # What orbax checks is that the file is there; what it writes is a sentence with the path.
 MARK, MARKED = "commit_success.txt", "Checkpoint commit was successful\n"
@@ -93,4 +92,4 @@ def packed_fingerprint(file: Path) -> str:
     Raises:
         BadZipFile: see `read_packed`.
     """
-    return hashlib.sha256(read_packed(file)[NAME]).hexdigest()[:12]
+    return fingerprint_of(read_packed(file)[NAME])

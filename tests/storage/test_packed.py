@@ -100,7 +100,7 @@ def test_a_damaged_one_is_named_and_leaves_the_others(packed, tmp_path, monkeypa
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["/tmp/x", "../x", "a/../../x"])
+@pytest.mark.parametrize("name", ["/x", "../x", "a/../../x"])
 def test_what_lies_outside_or_was_not_packed_here_is_refused(packed, name):
     file = packed / "policy" / "7.zip"
     with zipfile.ZipFile(file, "a") as archive:
