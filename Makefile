@@ -13,8 +13,8 @@ train: $(STAMP)
 	$(PY) train.py --config $(CONFIG) $(ARGS)
 
 # Two processes, since a test that compiles keeps one core busy; tests of a file share fixtures.
-# In the order that tests/conftest.py puts them. Those marked slow, a minute and more each, are left
-# to `make test-all`.
+# In the order that tests/conftest.py puts them. Those marked slow are left to `make test-all`: what
+# takes a minute, and what takes twenty seconds where a quicker test has the same code run.
 PYTEST = $(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)

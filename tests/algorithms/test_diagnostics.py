@@ -42,6 +42,7 @@ def test_gradient_shares_are_those_of_single_tasks(variant):
     assert norms.min() > 0 or variant == "pearl"  # which draws its tasks, here five rows
 
 
+@pytest.mark.slow
 def test_posterior_variance_is_that_of_the_first_transitions():
     learner, state, ring, figures = diagnosed("cmrl")
     inference = learner.inference

@@ -173,7 +173,9 @@ def test_a_packed_state_holds_every_parameter_once_and_is_unpacked_again(variant
             )
 
 
-@pytest.mark.parametrize("variant", ["cmrl", "c51", "pearl"])
+@pytest.mark.parametrize(
+    "variant", ["cmrl", *(pytest.param(name, marks=pytest.mark.slow) for name in ("c51", "pearl"))]
+)
 def test_one_step_moves_every_network_and_the_targets_by_tau(variant, ring, cmrl):
     cfg = tiny_config(**VARIANTS[variant])
     built = cmrl if variant == "cmrl" else build(cfg)

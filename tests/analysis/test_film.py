@@ -200,6 +200,7 @@ def test_video_and_sheet_show_the_episodes(gl, tmp_path, monkeypatch):
         assert (tmp_path / name).stat().st_size < 1_000_000
 
 
+@pytest.mark.slow
 def test_render_films_a_policy_checkpoint(gl, session, params, tmp_path):
     config = load_config("smoke.yaml")
     (tmp_path / "config.yaml").write_text(to_yaml(config))

@@ -62,7 +62,9 @@ def ring():
     return filled_ring()
 
 
-@pytest.mark.parametrize("adapt", ["posterior", "router", "all"])
+@pytest.mark.parametrize(
+    "adapt", ["posterior", pytest.param("router", marks=pytest.mark.slow), "all"]
+)
 def test_gradient_steps_change_what_is_adapted_and_nothing_else(made, ring, adapt):
     learner = RestrictedLearner(adapt, tiny_config(), GOALS, 3, 2)
     update = jax.jit(learner.update)

@@ -169,6 +169,7 @@ def test_other_settings_are_other_cells(runs, tmp_path):
     assert {row["checkpoint"] for row in rows} == {"2"}  # the last
 
 
+@pytest.mark.slow
 def test_short_memory_makes_smaller_batches(runs, swept, monkeypatch, capsys):
     needed = []
 
@@ -188,6 +189,7 @@ def test_short_memory_makes_smaller_batches(runs, swept, monkeypatch, capsys):
             assert returns[0] == pytest.approx(returns[1], 1e-4)
 
 
+@pytest.mark.slow
 def test_compare_takes_the_same_cells_one_by_one(runs, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_sweep, "COMMANDS", 1)
     path = tmp_path / "c.json"
