@@ -133,6 +133,7 @@ KINDS = {
     "mjx": lambda config, report: bench_physics.bench_backend("mjx", LANES, report),
     "stages": lambda config, report: bench_stages.bench_stages(LANES, report),
     "native": lambda config, report: bench_physics.bench_backend("native", LANES, report),
+    "native_workers": lambda config, report: bench_physics.bench_workers(report),
     "rollout": lambda config, report: bench_physics.bench_rollout(report),
     "metaworld": lambda config, report: bench_physics.bench_metaworld(report),
     "metaworld_vector": lambda config, report: bench_physics.bench_metaworld_vector(report),

@@ -21,12 +21,14 @@ from jax.experimental.compilation_cache import compilation_cache
 from cmrl_jax.jax_runtime import jit_repeated
 from envs.engine import mujoco
 from envs.physics.model import load_scene
+from envs.physics.native import NativePhysics
+from envs.physics.workers import processors
 from envs.sawyer import Ml4Env
 from envs.tasks import TASKS
 
 CONTROL_STEPS, REPEATS, SUBSTEPS = 20, 3, 5
 NAIVE_LANES, NAIVE_STEPS = 64, 2
-ROLLOUT_LANES = 256
+ROLLOUT_LANES = WORKER_LANES = 256
 METAWORLD_STEPS, VECTOR_PROCESSES = 1000, 2
 
 
@@ -86,6 +88,25 @@ def bench_backend(physics: str, lane_counts: tuple[int, ...], report: Report) ->
             report.add(f"{physics}/memory_per_lane_kb", kb, "kB", **label)
         grown = peak_memory_mb() - before
         report.add(f"{physics}/peak_memory_growth_mb", grown, "MB", **label)
+
+
+def bench_workers(report: Report) -> None:
+    """Host physics by the number of processes that simulate, at least up to 4."""
+    env = Ml4Env(physics="native")
+    task = jnp.arange(WORKER_LANES) % len(TASKS)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORKER_LANES), task)
+    count, most = 1, max(4, processors())
+    while count <= most:
+        physics = NativePhysics(count)
+        env.physics = physics
+        steps = jax.jit(random_steps(env))
+        jax.block_until_ready(steps(state, jax.random.key(1)))  # compiled, and the others started
+        seconds = best_seconds(lambda: steps(state, jax.random.key(1)))
+        physics.close()
+        rate = WORKER_LANES * CONTROL_STEPS / seconds
+        labels = {"lanes": WORKER_LANES, "workers": count}
+        report.add("native_workers/control_steps_per_s", rate, "1/s", **labels)
+        count *= 2
 
 
 def compile_twice(make: Callable[[], Any], *args: Any) -> tuple[Any, float, float]:

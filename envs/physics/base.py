@@ -14,11 +14,11 @@ import numpy as np
 from flax import struct
 
 from envs.engine import mujoco
-from envs.physics.model import SLIDE, Fixture, load_scene
+from envs.physics.model import FRAME_SKIP, SLIDE, Fixture, load_scene
 from envs.tasks.base import Task
 from envs.tasks.specs import SPECS
 
-SETTLE_STEPS, FRAME_SKIP = 50, 5  # SawyerXYZEnv._reset_hand; substeps of a control step
+SETTLE_STEPS = 50  # SawyerXYZEnv._reset_hand
 MOCAP_QUAT = (1.0, 0.0, 1.0, 0.0)  # SawyerMocapBase: the hand points down; MuJoCo normalises it
 
 

@@ -21,6 +21,7 @@ from envs.engine import mujoco
 SCENES = {"drawer": "sawyer_drawer.xml", "window": "sawyer_window_horizontal.xml"}
 FIXTURE_BODY = {"drawer": "drawer_link", "window": "windowb_a"}
 FIXTURE_ROOT = {"drawer": "drawer", "window": "window"}
+FRAME_SKIP = 5  # substeps of a control step
 ARM_JOINTS, ROBOT_JOINTS, JOINTS = 7, 9, 10  # arm hinges; + two finger slides; + the fixture slide
 RIGHT_FINGER, LEFT_FINGER, SLIDE = 7, 8, 9
 

@@ -96,7 +96,7 @@ def test_from_meta_worlds_own_state_every_bit_is_meta_worlds(env, replay):
             np.testing.assert_array_equal(got[ours][:, i], expected, err_msg=f"{TASKS[i]} {ours}")
 
 
-def test_threads_order_and_history_do_not_change_a_bit(env, replay):
+def test_workers_order_and_history_do_not_change_a_bit(env, replay):
     state, actions = reset(env), random_actions(12)
     expected = replay(state, actions)
     replay(reset(env, LANE_TASKS[::-1], LANE_GOALS[::-1] + 0.02), random_actions(3, seed=1))
@@ -109,9 +109,9 @@ def test_threads_order_and_history_do_not_change_a_bit(env, replay):
     alone = jax.jit(env.step)(jax.tree.map(lambda x: x[5], state), actions[0, 5])
     assert_same(alone, jax.tree.map(lambda x: x[0, 5], expected))
 
-    for threads in (1, 2, 4):
+    for workers in (1, 2, 4):
         other = Ml4Env(physics="native")
-        other.physics = NativePhysics(threads)
+        other.physics = NativePhysics(workers)
         step = jax.jit(jax.vmap(other.step))
         last = state
         for action in actions:

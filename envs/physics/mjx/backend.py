@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs.physics.base import FRAME_SKIP, Positions, settled_starts
+from envs.physics.base import Positions, settled_starts
 from envs.physics.mjx import rotations
 from envs.physics.mjx.contact import Contacts, find_contacts
 from envs.physics.mjx.geometry import FixtureShapes, load_gripper, load_shapes
@@ -22,6 +22,7 @@ from envs.physics.mjx.quiet import mjx
 from envs.physics.mjx.solver import Cones, Rows, make_cones, make_rows, solve
 from envs.physics.model import (
     ARM_JOINTS,
+    FRAME_SKIP,
     JOINTS,
     LEFT_FINGER,
     RIGHT_FINGER,
