@@ -49,6 +49,10 @@ KINDS = {
     "cmrl": "--config ml4.yaml",
     "pearl": "--config pearl.yaml --env.obs_mode canonical --collect.scatter 40"
     " --train.capacity 340000 --train.env_steps 600000 --sac.policy_average 0.1",
+    # PEARL's belief over transitions on the main job's own actor-critic: no text, no modules.
+    "pearlsac": "--config ml4.yaml --model.net mlp --model.mlp_hidden 128,128,128"
+    " --encoder.goal_fusion none --encoder.p_empty 0.0 --encoder.aux none"
+    " --collect.group_frac 0.5,0.0,0.5",
     "untrained": "--config ml4.yaml --train.env_steps 19200",
 }
 _K = f"--k {','.join(map(str, K))}"
@@ -66,9 +70,11 @@ EVALUATIONS = {  # flags of `eval`; native physics unless they say otherwise
     # Its own function adapts for 10 episodes and counts the 3 after them.
     "metaworld": "--adapt search --physics metaworld --k 0",
 }
+_OF_PEARL = ("posterior-task", "posterior-goal", "search-task", "search-goal", "trained")
 OF_KIND = {
     "cmrl": tuple(EVALUATIONS),
-    "pearl": ("posterior-task", "posterior-goal", "search-task", "search-goal", "trained"),
+    "pearl": _OF_PEARL,
+    "pearlsac": _OF_PEARL,
     "untrained": ("search-task", "search-goal"),
 }
 FINETUNE = "finetune"  # from the winner of a search, and SAC from scratch; needs the run itself
@@ -209,6 +215,8 @@ METHODS = {  # of (kind, adapt)
     ("cmrl", "posterior"): "cmrl-posterior",
     ("pearl", "posterior"): "pearl",
     ("pearl", "search"): "pearl-search",
+    ("pearlsac", "posterior"): "pearl-sac",
+    ("pearlsac", "search"): "pearl-sac-search",
     ("untrained", "search"): "untrained-search",
 }
 
