@@ -7,15 +7,14 @@ everything may be called from any thread, again and again.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from cmrl_jax.algorithms.base import Agent as Agent
 from cmrl_jax.algorithms.base import Algorithm as Algorithm
 from cmrl_jax.config.files import load_config as load_config
-from cmrl_jax.config.files import to_yaml
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config, ConfigError, call_envs, require
 from cmrl_jax.evaluation.options import EvalOptions, check_options, check_run
@@ -26,11 +25,13 @@ from cmrl_jax.registry import make_environment
 from cmrl_jax.registry import register_algorithm as register_algorithm
 from cmrl_jax.registry import register_environment as register_environment
 from cmrl_jax.stop import Stop
-from cmrl_jax.storage.run_dir import begun, check_same_config, find_run, new_run
+from cmrl_jax.storage.run_dir import all_begun, find_run, new_run, new_seed_dirs
 from cmrl_jax.training import trainer
 from cmrl_jax.training.loggers import Console, Logger, loggers_of
 from cmrl_jax.training.metrics import read_rows
 from envs.base import MetaEnv as MetaEnv
+
+LoggersOf = Callable[[Config], Sequence[Logger]]
 
 
 @dataclass(frozen=True)
@@ -82,22 +83,47 @@ class TrainResult:
         return list(read_rows(self.run_dir / "metrics.csv"))
 
 
+@overload
 def train(
     config: Config,
     run_dir: str | Path | None = None,
     *,
+    seeds: None = None,
     resume: bool = False,
     loggers: Sequence[Logger] | None = None,
     stop: Stop | None = None,
-) -> TrainResult:
+) -> TrainResult: ...
+@overload
+def train(
+    config: Config,
+    run_dir: str | Path | None = None,
+    *,
+    seeds: int,
+    resume: bool = False,
+    loggers: LoggersOf | None = None,
+    stop: Stop | None = None,
+) -> list[TrainResult]: ...
+def train(
+    config: Config,
+    run_dir: str | Path | None = None,
+    *,
+    seeds: int | None = None,
+    resume: bool = False,
+    loggers: Sequence[Logger] | LoggersOf | None = None,
+    stop: Stop | None = None,
+) -> TrainResult | list[TrainResult]:
     """Trains to the end of the configuration's schedule.
 
     Args:
         config: from `load_config`, or built by hand.
         run_dir: a directory without a run; by default a new one in `runs/`. With `resume`, the
             one to go on with, bit for bit as if it had not been left.
+        seeds: runs with that many seeds, from `config.seed` on, are trained in one program and
+            returned as a list; their directories are `run_dir`/seed0, `run_dir`/seed1 and so on.
+            Each leaves what it would leave alone, equal to within rounding.
         loggers: take rows and messages; by default lines on standard output, and TensorBoard
-            where `log.tensorboard` asks for it. An empty list is silent.
+            where `log.tensorboard` asks for it. An empty list is silent. With `seeds`, a function
+            from a run's configuration to its loggers.
         stop: `stop.request()`, from any thread, ends the run at the next border of an iteration.
 
     Raises:
@@ -105,21 +131,48 @@ def train(
             that holds another run, a damaged checkpoint.
     """
     validate(config)
-    for logger in loggers or ():
+    require(seeds is None or seeds > 0, f"seeds is {seeds}", "give one or more")
+    if resume and run_dir is None:
+        raise ConfigError("resume without a run directory", "name it: run_dir=")
+    place = None if run_dir is None else Path(run_dir)
+    # Looked at before anything is made.
+    numbers = range(config.seed, config.seed + (1 if seeds is None else seeds))
+    told = [_loggers_of(replace(config, seed=seed), loggers, seeds) for seed in numbers]
+    if place is None or not resume:
+        place = new_run(config.name, place)
+        found = {config.seed: place} if seeds is None else new_seed_dirs(place, numbers)
+    elif seeds is None:
+        found = {config.seed: find_run(place)}
+    else:
+        found = {seed: find_run(place / f"seed{seed}") for seed in numbers}
+    runs = [(replace(config, seed=seed), run) for seed, run in found.items()]
+    configs, dirs = zip(*runs, strict=True)
+    with all_begun(runs, resume):
+        outcomes = trainer.train_seeds(configs, dirs, told, stop, resume)
+    results = [
+        TrainResult(run, outcome.iteration, outcome.is_finished, outcome.evaluation)
+        for (_, run), outcome in zip(runs, outcomes, strict=True)
+    ]
+    return results if seeds is not None else results[0]
+
+
+def _loggers_of(
+    config: Config, loggers: Sequence[Logger] | LoggersOf | None, seeds: int | None
+) -> Sequence[Logger]:
+    """The loggers of one run, checked."""
+    if loggers is None:
+        label = "" if seeds is None else f"seed {config.seed}: "
+        return loggers_of(Console(progress=False, label=label), config)
+    if callable(loggers):
+        loggers = loggers(config)
+    else:
+        cause = f"a list of loggers would be shared by {seeds} seeds"
+        cure = "give a function: loggers=lambda config: [Mine()]"
+        require(seeds is None or not loggers, cause, cure)
+    for logger in loggers:
         cause = f"a logger is a {type(logger).__name__}, which is no cmrl_jax.Logger"
         require(isinstance(logger, Logger), cause, "make its class a subclass: class Mine(Logger)")
-    if resume:
-        if run_dir is None:
-            raise ConfigError("resume without a run directory", "name it: run_dir=")
-        run = find_run(Path(run_dir))
-        check_same_config(config, run)
-    else:
-        run = new_run(config.name, None if run_dir is None else Path(run_dir))
-    if loggers is None:
-        loggers = loggers_of(Console(progress=False), config)
-    with begun(run, to_yaml(config), resume):
-        outcome = trainer.train(config, run, loggers, stop, resume)
-    return TrainResult(run, outcome.iteration, outcome.is_finished, outcome.evaluation)
+    return loggers
 
 
 def load_agent(run_dir: str | Path, checkpoint: int | None = None) -> TrainedAgent:

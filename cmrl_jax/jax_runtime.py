@@ -103,6 +103,18 @@ def jit_once(function: Callable[..., Any], **options: Any) -> Any:
     return jax.jit(function, compiler_options={"xla_backend_optimization_level": 1}, **options)
 
 
+def free_bytes() -> int | None:
+    """Memory that the first device can still give; None where nobody says."""
+    stats = jax.local_devices()[0].memory_stats()
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if "MemAvailable" in line)
+    except (OSError, StopIteration):
+        return None
+
+
 @functools.cache  # so that a process that asks again is not told again
 def cache_directory(text: str) -> str | None:
     """A directory for compiled programs, made if need be; None, with a warning, where none can be.

@@ -37,8 +37,8 @@ def using(mesh: Mesh | None) -> contextlib.AbstractContextManager[Any]:
 
 
 def is_split() -> bool:
-    """Whether a mesh is in force."""
-    return not jax.sharding.get_abstract_mesh().empty
+    """Whether a mesh is in force, and not inside of what each device runs by itself."""
+    return jax.sharding.AxisType.Auto in jax.sharding.get_abstract_mesh().axis_types
 
 
 def split(tree: Any, axis: int = 0) -> Any:
@@ -64,6 +64,43 @@ def by_part(function: Callable[..., Any]) -> Callable[..., Any]:
         return function
     lanes = PartitionSpec(AXIS)
     return jax.shard_map(function, in_specs=lanes, out_specs=lanes, check_vma=False)
+
+
+def over_seeds(function: Callable[..., Any], mesh: Mesh | None, run: Any) -> Callable[..., Any]:
+    """`function`: RunState of seeds -> RunState, metrics; each device runs it on its own seeds.
+
+    Args:
+        run: the state's tree of axes, 0 where there is a leading seed axis, else None.
+    """
+    if mesh is None:
+        return function
+    specs = _specs(run)
+    return jax.shard_map(
+        function,
+        mesh=mesh,
+        in_specs=(specs,),
+        out_specs=(specs, PartitionSpec(AXIS)),
+        check_vma=False,
+    )
+
+
+def placed_seeds(shapes: Any, mesh: Mesh | None, axes: Any) -> Any:
+    """The shapes of a `RunState` of seeds with where each array lies; `axes` as of `over_seeds`."""
+    if mesh is None:
+        return shapes
+
+    def place(leaf: Any, spec: PartitionSpec) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=NamedSharding(mesh, spec))
+
+    is_none = lambda part: part is None
+    put = lambda leaf, spec: None if leaf is None else place(leaf, spec)
+    return jax.tree.map(put, shapes, _specs(axes), is_leaf=is_none)
+
+
+def _specs(axes: Any) -> Any:
+    """Where the leaves of a tree of axes lie: split over the devices by seed, or on each."""
+    of_axis = lambda axis: PartitionSpec() if axis is None else PartitionSpec(AXIS)
+    return jax.tree.map(of_axis, axes, is_leaf=lambda axis: axis is None)
 
 
 def _constrain(tree: Any, spec: PartitionSpec) -> Any:

@@ -15,7 +15,7 @@ from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.jax_runtime import cache_directory, check_switches, jit_repeated
 from cmrl_jax.storage.run_dir import holds_run
-from cmrl_jax.training.trainer import Schedule, _Run
+from cmrl_jax.training.run import Run
 from envs import goal_sets
 
 
@@ -111,18 +111,17 @@ def test_a_run_that_looks_for_nan_is_the_undisturbed_one(undisturbed, tmp_path):
 @pytest.mark.parametrize("name", ["jax_debug_nans", "jax_debug_infs"])
 def test_a_run_that_looks_for_nan_stops_at_the_first(name):
     """What is otherwise skipped or put back, with a line of warning."""
-    trainer = types.SimpleNamespace(config=load_config("smoke.yaml"), say=lambda line: None)
-    trainer.full = types.SimpleNamespace(directory="ckpt", steps=lambda: [3])
-    trainer.schedule = Schedule.of(trainer.config)
+    run = types.SimpleNamespace(config=load_config("smoke.yaml"), say=lambda line: None, label="")
+    run.full = types.SimpleNamespace(directory="ckpt", steps=lambda: [3])
     found = {"iteration": 3, "train/skipped": 0.0, "train/physics_faults": 0.0}
     faults = ({"train/skipped": 0.02}, {"train/physics_faults": 1.0})
     for fault in faults:
-        _Run.check_health(trainer, found | fault)  # pyright: ignore[reportArgumentType]
+        Run.check_health(run, found | fault)  # pyright: ignore[reportArgumentType]
     with getattr(jax, name.removeprefix("jax_"))(True):
-        _Run.check_health(trainer, found)  # pyright: ignore[reportArgumentType]
+        Run.check_health(run, found)  # pyright: ignore[reportArgumentType]
         for fault in faults:
             with pytest.raises(ConfigError, match="iteration 3: .*non-finite"):
-                _Run.check_health(trainer, found | fault)  # pyright: ignore[reportArgumentType]
+                Run.check_health(run, found | fault)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,11 @@ class RunState(struct.PyTreeNode):
     iteration: jax.Array
 
 
+def iteration_alone(run: RunState) -> RunState:
+    """`Algorithm.in_step` of a state that counts nothing else."""
+    return jax.tree.map(lambda _: False, run).replace(iteration=True)
+
+
 TrainIteration = Callable[[RunState], tuple[RunState, dict[str, jax.Array]]]
 
 
@@ -128,6 +133,8 @@ class Algorithm:
             (steps put back, share of gradients dropped: a run that has too many stops).
         policy_params: RunState -> the parameters that the agent acts with, saved as a policy.
         gradient_steps: RunState -> () int32, gradient steps applied.
+        in_step: RunState -> bool for every leaf: whether it depends on the number of iterations
+            alone, as counters and ring positions do. Seeds in one program share such a leaf.
         parts: the algorithm's own, for what inspects or fine-tunes it.
     """
 
@@ -136,6 +143,7 @@ class Algorithm:
     make_iteration: Callable[[jax.Array | None], TrainIteration]
     policy_params: Callable[[RunState], Any]
     gradient_steps: Callable[[RunState], jax.Array]
+    in_step: Callable[[RunState], RunState] = iteration_alone
     parts: Any = None
 
     @property

@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import typing
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,21 +19,22 @@ from cmrl_jax.config.files import (
     find_config,
     read_yaml,
     resolve,
-    to_yaml,
 )
-from cmrl_jax.config.schema import Config, ConfigError, leaves
+from cmrl_jax.config.schema import Config, ConfigError, leaves, require
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.run_dir import (
-    begun,
-    check_same_config,
+    all_begun,
     config_stem,
     find_run,
+    holds_run,
     new_run,
+    new_seed_dirs,
     resumed_run,
+    seed_dirs,
 )
 from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
 from cmrl_jax.text.goal_files import find_table
-from envs.command_line import typed_path
+from envs.command_line import typed_path, whole
 
 
 def train_parser() -> argparse.ArgumentParser:
@@ -48,6 +50,12 @@ def train_parser() -> argparse.ArgumentParser:
         "--config", metavar="X.yaml", type=typed_path, help="a file, or a name in configs/"
     )
     flags.add_argument("--run", metavar="DIR", type=typed_path, help="run directory [runs/X-TIME]")
+    flags.add_argument(
+        "--seeds",
+        metavar="N",
+        type=whole(1),
+        help="train N seeds, from `seed` on, in one program: runs DIR/seed0, DIR/seed1, ..",
+    )
     flags.add_argument(
         "--resume", action="store_true", help="go on with --run DIR, or with the newest run of X"
     )
@@ -78,49 +86,79 @@ def _metavar(default: Any, f: Any, name: str) -> str:
 def run_train(words: Sequence[str]) -> int:
     """The command `train`; returns the exit code."""
     args = vars(parse(train_parser(), words))
-    name, run, resume = args.pop("config"), args.pop("run"), args.pop("resume")
+    name, run, seeds, resume = (args.pop(key) for key in ("config", "run", "seeds", "resume"))
+    group = seed_dirs(run) if resume and run is not None and not holds_run(run) else {}
     if name is None and run is not None and resume:
-        name = find_run(run) / "config.yaml"
+        first = next(iter(group.values()), run)
+        name = find_run(first) / "config.yaml"
     if name is None:
         found = sorted({p.name for d in config_dirs()[1:] for p in d.glob("*.yaml")})
         raise ConfigError("no --config given", f"add --config with one of: {', '.join(found)}")
     path = find_config(name)
     config = resolve(*read_yaml(path), flags=args)
     _check_extras(config)
-    if resume:
-        run = resumed_run(config_stem(path), run)
-        check_same_config(config, run)
+    place: Path | None = run
+    if group:
+        cause = f"{run} holds {len(group)} seeds, not {seeds}"
+        require(seeds in (None, len(group)), cause, f"leave --seeds away, or --seeds {len(group)}")
+    elif resume:
+        cause = "--resume goes on with all seeds of a directory"
+        require(seeds is None, cause, "name it, without --seeds: --run DIR --resume")
+        place = resumed_run(config_stem(path), run)
     else:
-        run = new_run(config_stem(path), run)
-    with begun(run, to_yaml(config), resume):
+        place = new_run(config_stem(path), run)
+        if seeds is not None:
+            group = new_seed_dirs(place, range(config.seed, config.seed + seeds))
+    assert place is not None  # a group is found in a directory that was named
+    runs = [(replace(config, seed=seed), of_seed) for seed, of_seed in group.items()]
+    runs = runs or [(config, place)]
+    with all_begun(runs, resume):
         stop = StopSignal()  # before the imports that take seconds
         try:
-            return _in_console(config, run, stop, resume)
+            return _in_console(runs, place, stop, resume)
         finally:
             stop.restore()
 
 
-def _in_console(config: Config, run: Path, stop: Stop, resume: bool) -> int:
-    """Trains, and says how it ended; returns the exit code."""
+def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, resume: bool) -> int:
+    """Trains, and says how it ended; returns the exit code.
+
+    Args:
+        place: what the user calls the run, or the directory of all.
+    """
     from cmrl_jax.formats import format_duration
     from cmrl_jax.training import trainer
     from cmrl_jax.training.loggers import Console, loggers_of
 
     # Who cannot be told what happens has left: the run saves and ends.
-    console = Console(config.log.progress, on_error=stop.request)
-    loggers = loggers_of(console, config)
-    outcome = trainer.train(config=config, run_dir=run, loggers=loggers, stop=stop, resume=resume)
+    consoles = [
+        Console(
+            config.log.progress and len(runs) == 1,
+            on_error=stop.request,
+            label=f"seed {config.seed}: " if len(runs) > 1 else "",
+        )
+        for config, _ in runs
+    ]
+    outcome, *_ = trainer.train_seeds(
+        [config for config, _ in runs],
+        [run for _, run in runs],
+        [loggers_of(console, run[0]) for console, run in zip(consoles, runs, strict=True)],
+        stop,
+        resume,
+    )
+    console = consoles[0]
     if outcome.is_finished:
-        console.message(f"done in {format_duration(outcome.wall_s)}: {run}")
+        console.message(f"done in {format_duration(outcome.wall_s)}: {place}")
         return 0
     text = f"stopped after iteration {outcome.iteration}; "
-    text += f"go on with: {command('--run', run, '--resume')}"
+    text += f"go on with: {command('--run', place, '--resume')}"
     console.message(text)
-    if console.error is None:
+    error = next((console.error for console in consoles if console.error is not None), None)
+    if error is None:
         return 0
     to_stderr(text)
-    is_left = console.error.errno in READER_LEFT
-    return 0 if is_left else exit_code(console.error)
+    is_left = error.errno in READER_LEFT
+    return 0 if is_left else exit_code(error)
 
 
 def _check_extras(config: Config) -> None:

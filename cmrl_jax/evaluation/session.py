@@ -60,25 +60,64 @@ def prepare_jax(config: Config) -> str:
 class TrainingProgram:
     """The two programs of training: its first state, and an iteration, which takes a state's place.
 
+    With several seeds both are of all of them at once. Their states are one then, whose leaves have
+    a leading seed axis, but for those that are in step (`Algorithm.in_step`).
+
     Attributes:
+        seeds: how many.
+        one: shapes of a single seed's state.
         abstract: shapes of the state, placed on the devices.
-        init: key -> RunState.
-        metrics: shapes of an iteration's metrics.
+        metrics: shapes of a single seed's metrics.
     """
 
-    def __init__(self, algorithm: Algorithm, goals: jax.Array | None, mesh: Any):
-        shapes = jax.eval_shape(algorithm.init, jax.random.key(0))
-        self.abstract = parallel.placed(shapes, mesh)
+    def __init__(self, algorithm: Algorithm, goals: jax.Array | None, mesh: Any, seeds: int = 1):
+        self.seeds = seeds
+        init, iteration = algorithm.init, algorithm.make_iteration(goals)
+        shapes = jax.eval_shape(init, jax.random.key(0))
+        self._axes = None
+        if seeds == 1:
+            self.one = self.abstract = parallel.placed(shapes, mesh)
+        else:
+            axes = jax.tree.map(lambda same: None if same else 0, algorithm.in_step(shapes))
+            init = jax.vmap(init, out_axes=axes)
+            iteration = jax.vmap(iteration, in_axes=(axes,), out_axes=(axes, 0))
+            iteration = parallel.over_seeds(iteration, mesh, axes)
+            shapes_of_all = jax.eval_shape(init, jax.random.split(jax.random.key(0), seeds))
+            self.one, self._axes = shapes, axes
+            self.abstract = parallel.placed_seeds(shapes_of_all, mesh, axes)
+            mesh = None  # lanes are not split as well
         places = jax.tree.map(lambda leaf: leaf.sharding, self.abstract)
         # A program of its own, so that every leaf has a buffer: the iteration donates them all.
-        self.init = jit_once(algorithm.init, out_shardings=places)
-        iteration = algorithm.make_iteration(goals)
+        self._init = jit_once(init, out_shardings=places)
         with parallel.using(mesh):
             # Traced once, for the columns and for the program: tracing the physics takes seconds.
             program = jit_repeated(iteration, donate_argnums=0, out_shardings=(places, None))
             self._traced = program.trace(self.abstract)
         self.metrics = self._traced.out_info[1]
+        if seeds > 1:
+            first = lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype)
+            self.metrics = jax.tree.map(first, self.metrics)
         self._compiled: Any = None
+
+    def init(self, seeds: Sequence[int]) -> RunState:
+        """The state of the given seeds before iteration 0."""
+        keys = [jax.random.key(seed) for seed in seeds]
+        return self._init(keys[0] if self._axes is None else jnp.stack(keys))
+
+    def of_seed(self, state: RunState, index: int) -> RunState:
+        """One seed's state, as a run of that seed alone has it."""
+        if self._axes is None:
+            return state
+        take = lambda axis, leaf: leaf if axis is None else leaf[index]
+        return jax.tree.map(take, self._axes, state, is_leaf=lambda axis: axis is None)
+
+    def of_all(self, states: Sequence[RunState]) -> RunState:
+        """The inverse of `of_seed`: the state of all seeds."""
+        if self._axes is None:
+            return states[0]
+        join = lambda axis, *leaves: leaves[0] if axis is None else jnp.stack(leaves)
+        state = jax.tree.map(join, self._axes, *states, is_leaf=lambda axis: axis is None)
+        return jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), state, self.abstract)
 
     @property
     def is_compiled(self) -> bool:
@@ -208,12 +247,17 @@ class Session:
             for kind in [k for k, kept in self._parts.evaluators.items() if kept is evaluator]:
                 del self._parts.evaluators[kind]
 
-    def training(self, mesh: Any) -> TrainingProgram:
-        """The training iteration over a mesh of devices, traced and not yet compiled."""
-        kept = self._parts.training
-        if mesh not in kept:
-            kept[mesh] = TrainingProgram(self.algorithm, self.train_placements(), mesh)
-        return kept[mesh]
+    def training(self, mesh: Any, seeds: int = 1) -> TrainingProgram:
+        """The training iteration over a mesh of devices, traced and not yet compiled.
+
+        Args:
+            seeds: runs that it trains at once.
+        """
+        kept, kind = self._parts.training, (mesh, seeds)
+        if kind not in kept:
+            goals = self.train_placements()
+            kept[kind] = TrainingProgram(self.algorithm, goals, mesh, seeds)
+        return kept[kind]
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ import errno
 import os
 import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from cmrl_jax.commands import command, quoted
-from cmrl_jax.config.files import check_resumable, read_yaml
+from cmrl_jax.config.files import check_resumable, read_yaml, to_yaml
 from cmrl_jax.config.schema import Config, ConfigError, call_envs
 from cmrl_jax.storage.locks import lock
 from envs.command_line import brief, what_is
@@ -87,6 +87,25 @@ def resumed_run(stem: str, run: Path | None) -> Path:
         cause = f"--resume found no run of '{stem}' in {ROOT}/"
         raise ConfigError(cause, "name it with --run DIR, or start one without --resume")
     return runs[-1]
+
+
+def seed_dirs(base: Path) -> dict[int, Path]:
+    """The runs of several seeds that lie in one directory, by seed: `base/seed<n>`."""
+    found = {path: re.fullmatch(r"seed(\d+)", path.name) for path in base.glob("seed*")}
+    seeds = {int(match[1]): path for path, match in found.items() if match and holds_run(path)}
+    return dict(sorted(seeds.items()))
+
+
+def new_seed_dirs(base: Path, seeds: Iterable[int]) -> dict[int, Path]:
+    """Makes the directories of new runs of several seeds in one directory.
+
+    Raises:
+        ConfigError: where one holds a run already, or cannot be made.
+    """
+    dirs = {seed: base / f"seed{seed}" for seed in seeds}
+    for run in dirs.values():  # nothing is made if one of them is taken
+        check_unused(run)
+    return {seed: new_run(run.name, run) for seed, run in dirs.items()}
 
 
 def new_run(stem: str, run: Path | None, now: datetime.datetime | None = None) -> Path:
@@ -167,6 +186,21 @@ def begun(run: Path, config_yaml: str, resume: bool) -> Iterator[None]:
             if not resume:
                 forget_unbegun(run)
             raise
+
+
+@contextlib.contextmanager
+def all_begun(runs: Sequence[tuple[Config, Path]], resume: bool) -> Iterator[None]:
+    """Holds the directories of several runs, each with the configuration that is its own.
+
+    Raises:
+        ConfigError: as `begun`; or one is to be resumed with another configuration.
+    """
+    with contextlib.ExitStack() as held:
+        for config, run in runs:
+            if resume:
+                check_same_config(config, run)
+            held.enter_context(begun(run, to_yaml(config), resume))
+        yield
 
 
 def cannot_write(run: Path, error: OSError) -> ConfigError:

@@ -68,6 +68,9 @@ class Console(Logger):
 
     A stream that can no longer be written raises nothing here: `error` says why, later lines are
     lost, and `on_error` is called once.
+
+    Args:
+        label: what the lines of iterations begin with.
     """
 
     def __init__(
@@ -75,7 +78,9 @@ class Console(Logger):
         progress: bool = True,
         stream: TextIO | None = None,
         on_error: Callable[[], None] = lambda: None,
+        label: str = "",
     ):
+        self._label = label
         self._stream = Output(stream or sys.stdout, on_error)
         self._tasks: tuple[str, ...] = ()
         self._progress = None
@@ -100,9 +105,9 @@ class Console(Logger):
         self._tasks = run.train_tasks
 
     def row(self, row: Row, progress: Progress) -> None:
-        self.message(format_iteration(row, self._tasks, progress.seconds_left))
+        self.message(self._label + format_iteration(row, self._tasks, progress.seconds_left))
         if evaluation := format_evaluation(row):
-            self.message(evaluation)
+            self.message(self._label + evaluation)
         self._advance(progress.share)
 
     def message(self, text: str) -> None:

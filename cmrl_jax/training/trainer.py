@@ -6,6 +6,7 @@ this file only decides when, and writes things down. NOTE: this is the one impur
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -18,18 +19,18 @@ import jax
 import numpy as np
 
 from cmrl_jax import parallel
-from cmrl_jax.algorithms.base import RunState
-from cmrl_jax.config.schema import Config, ConfigError, lanes_per_task
+from cmrl_jax.algorithms.base import Algorithm, RunState
+from cmrl_jax.config.schema import Config, require
 from cmrl_jax.evaluation.scores import fault_warning, format_scores, of_policy, summarise
-from cmrl_jax.evaluation.session import Session, prepare_jax
+from cmrl_jax.evaluation.session import Session, TrainingProgram, prepare_jax
+from cmrl_jax.jax_runtime import free_bytes
 from cmrl_jax.registry import rules_of
 from cmrl_jax.stop import Stop
-from cmrl_jax.storage.checkpoint import full_store, join_run, policy_store, split_run
+from cmrl_jax.storage.checkpoint import full_store, policy_store
 from cmrl_jax.storage.run_dir import write_text
-from cmrl_jax.storage.versions import package_versions, write_versions
-from cmrl_jax.text.goals import check_same_table
-from cmrl_jax.training.loggers import Logger, Progress, RunInfo
-from cmrl_jax.training.metrics import LEADING_COLUMNS, MetricsCsv, metric_names, metric_row
+from cmrl_jax.training.loggers import Logger, Progress
+from cmrl_jax.training.metrics import LEADING_COLUMNS, metric_names, metric_row
+from cmrl_jax.training.run import Run, Saved, steps_of
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
 
@@ -47,7 +48,7 @@ class Schedule:
 
     @classmethod
     def of(cls, config: Config) -> Schedule:
-        steps = config.collect.lanes * config.env.horizon
+        steps = steps_of(config)
         total = math.ceil(config.train.env_steps / steps) if config.train.env_steps else None
         tasks = len(config.tasks.train) + len(config.tasks.test)
         episodes = max(config.eval.k) + 1
@@ -97,107 +98,133 @@ def train(
     Raises:
         ConfigError: anything the user can mend, before the first compile where possible.
     """
+    return train_seeds([config], [run_dir], [loggers], stop, resume)[0]
+
+
+def train_seeds(
+    configs: Sequence[Config],
+    run_dirs: Sequence[Path],
+    loggers: Sequence[Sequence[Logger]],
+    stop: Stop | None = None,
+    resume: bool = False,
+) -> list[Outcome]:
+    """Trains runs that differ in their seed alone, all in one program; arguments one a run.
+
+    Each leaves what it would leave if it were trained alone. Figures are not equal to the last bit:
+    a product of matrices for several seeds adds up in another order than one for each.
+
+    Raises:
+        ConfigError: as `train`.
+    """
     # All that refuses a configuration stands before the stores: they are what makes a run begin.
-    device = prepare_jax(config)
-    rules_of(config).check_devices(parallel.size(parallel.make_mesh()))
+    config, device = configs[0], prepare_jax(configs[0])
+    mesh = parallel.make_mesh()
+    if len(configs) == 1:
+        rules_of(config).check_devices(parallel.size(mesh))
     session = Session(config)
-    with full_store(run_dir, config.checkpoint.keep) as full, policy_store(run_dir) as policy:
-        run = _Run(config, run_dir, session, full, policy, loggers, stop or Stop())
-        return run.go(device, resume)
+    check_memory(session.algorithm, len(configs))
+    program = session.training(mesh, len(configs))
+    with contextlib.ExitStack() as stores:
+        runs = []
+        for config, run_dir, told in zip(configs, run_dirs, loggers, strict=True):
+            full = stores.enter_context(full_store(run_dir, config.checkpoint.keep))
+            policy = stores.enter_context(policy_store(run_dir))
+            label = f"seed {config.seed}: " if len(configs) > 1 else ""
+            runs.append(Run(config, run_dir, session, (full, policy), told, label))
+        return _Training(session, program, runs, stop or Stop()).go(device, resume)
+
+
+def check_memory(algorithm: Algorithm, seeds: int) -> None:
+    """Raises ConfigError if the states of several seeds would not fit into the devices' memory.
+
+    A device holds one more than its own, since what is saved is a copy.
+    """
+    state = jax.eval_shape(algorithm.init, jax.random.key(0))
+    each = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+    free, devices = free_bytes(), parallel.size(parallel.make_mesh())
+    if seeds == 1 or free is None:
+        return
+    fits = devices * max(free // each - 1, 0)
+    cause = f"{seeds} seeds of {each / 2**20:.0f} MiB each do not fit into {free / 2**20:.0f} MiB"
+    cure = f"--seeds {fits}" if fits else "set a smaller train.capacity"
+    require(seeds <= fits, cause, cure)
+    cause = f"{seeds} seeds cannot be divided among {devices} devices"
+    require(seeds % devices == 0, cause, f"--seeds {-(-seeds // devices) * devices}")
 
 
 class _Stopped(Exception):
     """The final evaluation is left: it was asked to stop."""
 
 
-class _Run:
-    """One process's share of a run."""
+class _Training:
+    """The loop of one process: the state of all its runs, and what is due after each iteration."""
 
-    def __init__(
-        self,
-        config: Config,
-        run_dir: Path,
-        session: Session,
-        full: Any,
-        policy: Any,
-        loggers: Sequence[Logger],
-        stop: Stop,
-    ):
-        self.config, self.run_dir, self.loggers, self.stop = config, run_dir, loggers, stop
-        self.session, self.full, self.policy = session, full, policy
-        self.algorithm = session.algorithm
-        self.schedule = Schedule.of(config)
+    def __init__(self, session: Session, program: TrainingProgram, runs: Sequence[Run], stop: Stop):
+        self.session, self.program, self.runs, self.stop = session, program, runs, stop
+        self.algorithm, self.config = session.algorithm, session.config
+        self.schedule = Schedule.of(self.config)
 
     def say(self, text: str) -> None:
-        for logger in self.loggers:
+        """A message about all runs."""
+        for logger in self.runs[0].loggers:
             logger.message(text)
 
-    def go(self, device: str, resume: bool) -> Outcome:
+    def go(self, device: str, resume: bool) -> list[Outcome]:
         try:
             return self.train(device, resume)
         finally:
-            for logger in self.loggers:
-                logger.close()
+            for run in self.runs:
+                run.close()
 
-    def train(self, device: str, resume: bool) -> Outcome:
+    def train(self, device: str, resume: bool) -> list[Outcome]:
         self.say(f"device: {device}")
-        program = self.session.training(parallel.make_mesh())
-        self.init = program.init
-        self.start(program.abstract, self.columns(program.metrics), resume)
-        try:
-            if self.iterations_left() and not self.stop.requested:
-                if not program.is_compiled:
-                    self.timed("the training iteration", program.compile)
-                self.iteration = program.compile()
-            while self.iterations_left() and not self.stop.requested:
-                self.step()
-            self.save()
-            evaluation = None if self.stop.requested else self.finish()
-            return Outcome(self.done, evaluation is not None, evaluation, self.wall)
-        finally:
-            self.csv.close()
+        self.start(resume)
+        if self.iterations_left() and not self.stop.requested:
+            if not self.program.is_compiled:
+                self.timed("the training iteration", self.program.compile)
+            self.iteration = self.program.compile()
+        while self.iterations_left() and not self.stop.requested:
+            self.step()
+        self.save()
+        found = None if self.stop.requested else self.finish()
+        evaluations = found or [None] * len(self.runs)
+        return [Outcome(self.done, found is not None, e, self.wall) for e in evaluations]
 
-    def columns(self, metrics: dict[str, Any]) -> list[str]:
+    def columns(self) -> list[str]:
         config, tasks = self.config, self.session.eval_tasks
         evals = [f"eval/{t}/k{k}/{f}" for t in tasks for k in config.eval.k for f in EVAL_FIGURES]
         times = ["time/iteration_s", "time/env_steps_per_s", "time/evaluation_s"]
-        return [*LEADING_COLUMNS, *metric_names(metrics, config.tasks.train), *evals, *times]
+        names = metric_names(self.program.metrics, config.tasks.train)
+        return [*LEADING_COLUMNS, *names, *evals, *times]
 
-    def start(self, abstract: RunState, columns: list[str], resume: bool) -> None:
+    def start(self, resume: bool) -> None:
         """A new state, saved before its first iteration, or the state of the last checkpoint."""
-        csv_path = self.run_dir / "metrics.csv"
-        config = self.config
-        if resume and self.full.steps():
-            trees, meta = self.full.resume(split_run(abstract), config, package_versions())
-            check_same_table(self.session.goals, meta["goals_sha256"], self.run_dir)
-            self.policy.drop_after(meta["iteration"])
-            self.state = join_run(abstract, trees)
-            self.done, self.wall = meta["iteration"], meta["wall_s"]
-            self.csv = MetricsCsv(csv_path, columns, offset=meta["csv_offset"])
-            self.say(f"resuming {self.run_dir} after iteration {self.done}")
-        else:
-            if resume:
-                self.check_unsaved(csv_path)
-                self.say(f"{self.run_dir} was stopped before its first save: starting it anew")
-            self.state = self.init(jax.random.key(config.seed))
-            self.done, self.wall = 0, 0.0
-            self.csv = MetricsCsv(csv_path, columns)
-        write_versions(self.run_dir / "versions.json")
-        for logger in self.loggers:
-            begun = time.time() - self.wall
-            logger.start(RunInfo(self.run_dir, config.tasks.train, self.csv.rows(), begun))
-        self.evaluator = self.session.evaluator()
+        saved = [run.saved(self.program.one) if resume else None for run in self.runs]
+        # A process that was killed while it saved leaves some of its runs one save behind.
+        iterations = [found.meta["iteration"] if found else 0 for found in saved]
+        self.done = min(iterations)
+        for i, run in enumerate(self.runs):
+            if iterations[i] > self.done:
+                saved[i] = run.saved(self.program.one, self.done)
+        self.state = self.first_state(saved)
+        self.wall = max((found.meta["wall_s"] for found in saved if found), default=0.0)
+        for run, found in zip(self.runs, saved, strict=True):
+            run.start(self.columns(), found)
+        self.evaluator = self.session.evaluator(policies=len(self.runs))
         self.clock = time.monotonic() - self.wall
         self.save()
 
-    def check_unsaved(self, csv_path: Path) -> None:
-        """A run saves before its first row: rows without a checkpoint mean that it was lost."""
-        rows = csv_path.read_bytes().count(b"\n") - 1 if csv_path.is_file() else 0
-        if rows > 0 or self.policy.steps():
-            raise ConfigError(
-                f"{self.run_dir} has {rows} rows in metrics.csv but no checkpoint in ckpt/",
-                "put ckpt/ back from a copy, or start a new run in another --run DIR",
-            )
+    def first_state(self, saved: Sequence[Saved | None]) -> RunState:
+        """The state of all runs: what was saved, and a new one of each that had not saved yet."""
+        program = self.program
+        if all(saved):
+            return program.of_all([found.state for found in saved if found])
+        new = program.init([run.config.seed for run in self.runs])
+        if not any(saved):
+            return new
+        return program.of_all(
+            [found.state if found else program.of_seed(new, i) for i, found in enumerate(saved)]
+        )
 
     def timed(self, what: str, compile: Callable[[], Any]) -> Any:
         """Announces a compile and says how long it took."""
@@ -213,8 +240,8 @@ class _Run:
         return in_time and (total is None or self.done < total)
 
     def step(self) -> None:
-        """One iteration, its row, and whatever is due after it."""
-        config, started = self.config, time.monotonic()
+        """One iteration, its rows, and whatever is due after it."""
+        started = time.monotonic()
         # Of a whole iteration jax could only say that there is a NaN, and iteration 0's losses are
         # NaN on purpose; `check_health` does what JAX_DEBUG_NANS asks for.
         with jax.debug_nans(False), jax.debug_infs(False):
@@ -222,86 +249,67 @@ class _Run:
         metrics = jax.tree.map(np.asarray, metrics)
         seconds = time.monotonic() - started
         self.done += 1
-        steps = self.done * self.schedule.steps_per_iteration
-        row: dict[str, Any] = {
+        rows = [self.row(i, metrics, seconds) for i in range(len(self.runs))]
+        for run, row in zip(self.runs, rows, strict=True):
+            run.check_health(row)
+        if self.schedule.is_eval_due(self.done):
+            rows = [row | found for row, found in zip(rows, self.evaluate(), strict=True)]
+        self.wall = time.monotonic() - self.clock
+        progress = Progress(self.share_done(), self.seconds_left())
+        for run, row in zip(self.runs, rows, strict=True):
+            run.write(row | {"wall_s": self.wall}, progress)
+        if self.is_policy_due() or self.wall - self.saved_at >= 60 * self.config.checkpoint.minutes:
+            self.save()
+
+    def row(self, i: int, metrics: dict[str, Any], seconds: float) -> dict[str, Any]:
+        """The figures of an iteration of the i-th run."""
+        gradient_steps = np.ravel(self.algorithm.gradient_steps(self.state))
+        if len(self.runs) > 1:
+            metrics = {name: value[i] for name, value in metrics.items()}
+        return {
             "iteration": self.done - 1,
-            "env_steps": steps,
-            "gradient_steps": int(self.algorithm.gradient_steps(self.state)),
-            "seed": config.seed,
+            "env_steps": self.done * self.schedule.steps_per_iteration,
+            "gradient_steps": int(gradient_steps[i]),
+            "seed": self.runs[i].config.seed,
             "time/iteration_s": seconds,
             "time/env_steps_per_s": self.schedule.steps_per_iteration / seconds,
-        } | metric_row(metrics, config.tasks.train)
-        self.check_health(row)
-        if self.schedule.is_eval_due(self.done):
-            row |= self.evaluate()
-        self.wall = time.monotonic() - self.clock
-        row["wall_s"] = self.wall
-        self.csv.write(row)
-        for logger in self.loggers:
-            logger.row(row, Progress(self.share_done(), self.seconds_left()))
-        if self.is_policy_due() or self.wall - self.saved_at >= 60 * config.checkpoint.minutes:
-            self.save()
+        } | metric_row(metrics, self.config.tasks.train)
 
     def is_policy_due(self) -> bool:
         """Whether this border has a policy checkpoint, however long the iterations took."""
         return self.done > 0 and self.done % self.config.checkpoint.policy_every == 0
 
-    def check_health(self, row: dict[str, Any]) -> None:
-        """Warns of what was skipped or put back; stops a run that cannot recover by itself.
-
-        Under JAX_DEBUG_NANS or JAX_DEBUG_INFS it stops at the first.
-        """
-        is_strict = jax.config.jax_debug_nans or jax.config.jax_debug_infs
-        config, iteration = self.config, row["iteration"]
-        kept = f"{self.full.directory} keeps iteration {self.full.steps()[-1]}"
-        skipped = row.get("train/skipped") or 0.0
-        faults = int(row.get("train/physics_faults") or 0)
-        if skipped == 1.0 or (skipped and is_strict):
-            share = (
-                "every gradient was" if skipped == 1.0 else f"{skipped:.1%} of the gradients were"
+    def evaluate(self) -> list[dict[str, Any]]:
+        """Columns of a periodic evaluation of every run: few goals, few k, all tasks."""
+        started, evaluation, rows = time.monotonic(), self.config.eval, []
+        summaries = self.scores(evaluation.goals, evaluation.k)
+        for run, summary in zip(self.runs, summaries, strict=True):
+            for line in fault_warning(summary):
+                run.say(line)
+            rows.append(
+                {
+                    f"eval/{task}/k{k}/{figure}": figures[figure]
+                    for task, by_k in summary.items()
+                    for k, figures in by_k.items()
+                    for figure in EVAL_FIGURES
+                }
             )
-            raise ConfigError(
-                f"iteration {iteration}: {share} non-finite",
-                f"{rules_of(config).on_bad_gradients}; {kept}",
-            )
-        # As many as a whole task collects: what is learned from is no longer the task.
-        if faults >= lanes_per_task(config) * config.env.horizon or (faults and is_strict):
-            other = "native" if config.env.physics == "mjx" else "mjx"
-            simulator = f"with env.physics: {other}, or " if config.env.name == "ml4" else ""
-            raise ConfigError(
-                f"iteration {iteration}: the physics of {faults} of "
-                f"{self.schedule.steps_per_iteration} control steps was non-finite",
-                f"start a new run {simulator}without the last change; {kept}",
-            )
-        if skipped:
-            self.say(f"warning: {skipped:.1%} of the gradients were non-finite and were skipped")
-        if faults:
-            self.say(f"warning: {faults} lane(s) left the range of float32 and were put back")
-
-    def evaluate(self) -> dict[str, Any]:
-        """Columns of a periodic evaluation: few goals, few k, all tasks."""
-        started, evaluation = time.monotonic(), self.config.eval
-        summary = self.scores(evaluation.goals, evaluation.k)
-        for line in fault_warning(summary):
-            self.say(line)
-        row: dict[str, Any] = {
-            f"eval/{task}/k{k}/{figure}": figures[figure]
-            for task, by_k in summary.items()
-            for k, figures in by_k.items()
-            for figure in EVAL_FIGURES
-        }
-        return row | {"time/evaluation_s": time.monotonic() - started}
+        return [row | {"time/evaluation_s": time.monotonic() - started} for row in rows]
 
     def scores(
         self, goals: int, k: tuple[int, ...], check: Callable[[], None] = lambda: None
-    ) -> dict[str, Any]:
-        params = parallel.on_one_device(self.algorithm.policy_params(self.state))
+    ) -> list[dict[str, Any]]:
+        """The summary of every run's policy."""
+        states = (self.program.of_seed(self.state, i) for i in range(len(self.runs)))
+        act = self.algorithm.policy_params
+        policies = [parallel.on_one_device(act(state)) for state in states]
         trial = self.session.trial(self.config.eval.goal_set, goals)
         if not self.evaluator.is_compiled:
             width = trial.texts.shape[-1]
-            self.timed("the evaluation episode", lambda: self.evaluator.compile(params, width))
-        scores = self.evaluator.run([params], trial, k, self.config.eval.seed, check)
-        return summarise(of_policy(scores, 0), trial.tasks)
+            compile = lambda: self.evaluator.compile(policies[0], width)
+            self.timed("the evaluation episode", compile)
+        scores = self.evaluator.run(policies, trial, k, self.config.eval.seed, check)
+        return [summarise(of_policy(scores, i), trial.tasks) for i in range(len(policies))]
 
     def share_done(self) -> float:
         total, minutes = self.schedule.iterations, self.config.train.minutes
@@ -315,28 +323,14 @@ class _Run:
         return self.wall * max(1 / share - 1, 0.0) if share else math.inf
 
     def save(self) -> None:
-        """A full checkpoint of this border, and a policy checkpoint where one is due."""
+        """A checkpoint of this border, of every run."""
         self.saved_at = self.wall
-        meta = {
-            "config": dataclasses.asdict(self.config),
-            "iteration": self.done,
-            "env_steps": self.done * self.schedule.steps_per_iteration,
-            "wall_s": self.wall,
-            "csv_offset": self.csv.offset,
-            "versions": package_versions(),
-            "goals_sha256": self.session.goals.sha256,
-        }
-        self.full.save(split_run(self.state), meta)
         is_last = self.stop.requested or not self.iterations_left()
-        # After the full one: a kill in between leaves a policy to write again, not one too many.
-        if self.is_policy_due() or (self.done and is_last):
-            policy = {
-                "params": self.algorithm.policy_params(self.state),
-                "goal_vectors": self.session.goals.vectors[:, 0],
-            }
-            self.policy.save({"policy": policy}, meta)
+        with_policy = self.is_policy_due() or bool(self.done and is_last)
+        for i, run in enumerate(self.runs):
+            run.save(self.program.of_seed(self.state, i), self.done, self.wall, with_policy)
 
-    def finish(self) -> dict[str, Any] | None:
+    def finish(self) -> list[dict[str, Any]] | None:
         """The final evaluation: more goals, every k, written beside the CSV.
 
         Left at once, with None, where a stop is asked for: all is saved, and a resumed run
@@ -344,20 +338,21 @@ class _Run:
         """
         evaluation = self.config.eval
         try:
-            summary = self.scores(evaluation.final_goals, evaluation.final_k, self.check_stop)
+            summaries = self.scores(evaluation.final_goals, evaluation.final_k, self.check_stop)
         except _Stopped:
             return None
-        result = {
-            "tasks": summary,
-            "goals": evaluation.final_goals,
-            "goal_set": evaluation.goal_set,
-            "horizon": self.evaluator.horizon,
-            "iteration": self.done,
-            "seed": evaluation.seed,
-        }
-        write_text(self.run_dir / "eval.json", json.dumps(result, indent=2) + "\n")
-        self.say(format_scores(summary))
-        return summary
+        for run, summary in zip(self.runs, summaries, strict=True):
+            result = {
+                "tasks": summary,
+                "goals": evaluation.final_goals,
+                "goal_set": evaluation.goal_set,
+                "horizon": self.evaluator.horizon,
+                "iteration": self.done,
+                "seed": evaluation.seed,
+            }
+            write_text(run.run_dir / "eval.json", json.dumps(result, indent=2) + "\n")
+            run.say(("\n" if run.label else "") + format_scores(summary))
+        return summaries
 
     def check_stop(self) -> None:
         if self.stop.requested:

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import jax
 
-from cmrl_jax.algorithms.base import Agent, Algorithm, RunState
+from cmrl_jax.algorithms.base import Agent, Algorithm, RunState, iteration_alone
 from cmrl_jax.algorithms.cmrl.agent import CmrlAgent, make_policy_params
 from cmrl_jax.algorithms.cmrl.collect import TrainIteration, init_run
 from cmrl_jax.algorithms.cmrl.learner import Learner
 from cmrl_jax.algorithms.cmrl.search import ArmsInTurn, SearchAgent
 from cmrl_jax.config.schema import Config
 from envs.base import MetaEnv
+
+RINGS = ("replay", "context")  # of a RunState
 
 
 def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
@@ -30,6 +32,11 @@ def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
     def gradient_steps(run: RunState) -> jax.Array:
         return run.learner.gradient_steps
 
+    def in_step(run: RunState) -> RunState:
+        same = iteration_alone(run)
+        rings = {name: getattr(same, name).replace(index=True, size=True) for name in RINGS}
+        return same.replace(**rings)
+
     agents: dict[str, Agent] = {"posterior": CmrlAgent(learner, config.collect.chunk)}
     if learner.inference is not None:
         agents["search"] = SearchAgent(learner, config.collect.chunk, env.symmetries)
@@ -40,5 +47,6 @@ def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
         make_iteration=make_iteration,
         policy_params=make_policy_params(learner),
         gradient_steps=gradient_steps,
+        in_step=in_step,
         parts=learner,
     )
