@@ -25,7 +25,7 @@ from cmrl_jax.registry import make_environment
 from cmrl_jax.registry import register_algorithm as register_algorithm
 from cmrl_jax.registry import register_environment as register_environment
 from cmrl_jax.stop import Stop
-from cmrl_jax.storage.run_dir import all_begun, find_run, new_run, new_seed_dirs
+from cmrl_jax.storage.run_dir import all_begun, find_run, runs_at
 from cmrl_jax.training import trainer
 from cmrl_jax.training.loggers import Console, Logger, loggers_of
 from cmrl_jax.training.metrics import read_rows
@@ -135,19 +135,13 @@ def train(
     if resume and run_dir is None:
         raise ConfigError("resume without a run directory", "name it: run_dir=")
     place = None if run_dir is None else Path(run_dir)
-    # Looked at before anything is made.
-    numbers = range(config.seed, config.seed + (1 if seeds is None else seeds))
-    told = [_loggers_of(replace(config, seed=seed), loggers, seeds) for seed in numbers]
-    if place is None or not resume:
-        place = new_run(config.name, place)
-        found = {config.seed: place} if seeds is None else new_seed_dirs(place, numbers)
-    elif seeds is None:
-        found = {config.seed: find_run(place)}
-    else:
-        found = {seed: find_run(place / f"seed{seed}") for seed in numbers}
-    runs = [(replace(config, seed=seed), run) for seed, run in found.items()]
+    _check_loggers(loggers, seeds)
+    place, runs = runs_at(config, config.name, place, seeds, resume)
+    cause = f"{place} holds {len(runs)} seeds"
+    require(seeds is not None or len(runs) == 1, cause, f"give seeds={len(runs)}")
     configs, dirs = zip(*runs, strict=True)
-    with all_begun(runs, resume):
+    told = [_loggers_of(one, loggers, seeds) for one in configs]
+    with all_begun(runs, resume, place):
         outcomes = trainer.train_seeds(configs, dirs, told, stop, resume)
     results = [
         TrainResult(run, outcome.iteration, outcome.is_finished, outcome.evaluation)
@@ -156,22 +150,27 @@ def train(
     return results if seeds is not None else results[0]
 
 
+def _check_loggers(loggers: Sequence[Logger] | LoggersOf | None, seeds: int | None) -> None:
+    if loggers is None or callable(loggers):
+        return
+    cause = f"a list of loggers would be shared by {seeds} seeds"
+    cure = "give a function: loggers=lambda config: [Mine()]"
+    require(seeds is None or not loggers, cause, cure)
+    for logger in loggers:
+        cause = f"a logger is a {type(logger).__name__}, which is no cmrl_jax.Logger"
+        require(isinstance(logger, Logger), cause, "make its class a subclass: class Mine(Logger)")
+
+
 def _loggers_of(
     config: Config, loggers: Sequence[Logger] | LoggersOf | None, seeds: int | None
 ) -> Sequence[Logger]:
-    """The loggers of one run, checked."""
+    """The loggers of one run."""
     if loggers is None:
         label = "" if seeds is None else f"seed {config.seed}: "
         return loggers_of(Console(progress=False, label=label), config)
     if callable(loggers):
         loggers = loggers(config)
-    else:
-        cause = f"a list of loggers would be shared by {seeds} seeds"
-        cure = "give a function: loggers=lambda config: [Mine()]"
-        require(seeds is None or not loggers, cause, cure)
-    for logger in loggers:
-        cause = f"a logger is a {type(logger).__name__}, which is no cmrl_jax.Logger"
-        require(isinstance(logger, Logger), cause, "make its class a subclass: class Mine(Logger)")
+        _check_loggers(loggers, None)
     return loggers
 
 

@@ -104,13 +104,14 @@ def jit_once(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def free_bytes() -> int | None:
-    """Memory that the first device can still give; None where nobody says."""
+    """Memory that each device can still give; None where nobody says."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if "MemAvailable" in line)
+        free = next(1024 * int(line.split()[1]) for line in lines if "MemAvailable" in line)
+        return free // len(jax.local_devices())
     except (OSError, StopIteration):
         return None
 

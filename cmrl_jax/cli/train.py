@@ -6,7 +6,6 @@ import argparse
 import importlib.util
 import typing
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,16 +21,7 @@ from cmrl_jax.config.files import (
 )
 from cmrl_jax.config.schema import Config, ConfigError, leaves, require
 from cmrl_jax.stop import Stop
-from cmrl_jax.storage.run_dir import (
-    all_begun,
-    config_stem,
-    find_run,
-    holds_run,
-    new_run,
-    new_seed_dirs,
-    resumed_run,
-    seed_dirs,
-)
+from cmrl_jax.storage.run_dir import all_begun, config_stem, find_run, runs_at, seed_dirs
 from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
 from cmrl_jax.text.goal_files import find_table
 from envs.command_line import typed_path, whole
@@ -41,7 +31,8 @@ def train_parser() -> argparse.ArgumentParser:
     """Flags of `train`: one for each leaf of the config schema, with its text and default."""
     flags = Parser(
         prog=program(),
-        usage="%(prog)s --config X.yaml [--section.key VALUE ...] [--run DIR] [--resume]",
+        usage="%(prog)s --config X.yaml [--section.key VALUE ...] [--run DIR] [--seeds N] "
+        "[--resume]",
         description="Meta-trains on the tasks of a YAML config, in one process, on any device.",
         epilog=f"commands: {', '.join(COMMANDS)}; each has its own --help",
         allow_abbrev=False,
@@ -87,9 +78,8 @@ def run_train(words: Sequence[str]) -> int:
     """The command `train`; returns the exit code."""
     args = vars(parse(train_parser(), words))
     name, run, seeds, resume = (args.pop(key) for key in ("config", "run", "seeds", "resume"))
-    group = seed_dirs(run) if resume and run is not None and not holds_run(run) else {}
     if name is None and run is not None and resume:
-        first = next(iter(group.values()), run)
+        first = next(iter(seed_dirs(run).values()), run)
         name = find_run(first) / "config.yaml"
     if name is None:
         found = sorted({p.name for d in config_dirs()[1:] for p in d.glob("*.yaml")})
@@ -97,22 +87,10 @@ def run_train(words: Sequence[str]) -> int:
     path = find_config(name)
     config = resolve(*read_yaml(path), flags=args)
     _check_extras(config)
-    place: Path | None = run
-    if group:
-        cause = f"{run} holds {len(group)} seeds, not {seeds}"
-        require(seeds in (None, len(group)), cause, f"leave --seeds away, or --seeds {len(group)}")
-    elif resume:
-        cause = "--resume goes on with all seeds of a directory"
-        require(seeds is None, cause, "name it, without --seeds: --run DIR --resume")
-        place = resumed_run(config_stem(path), run)
-    else:
-        place = new_run(config_stem(path), run)
-        if seeds is not None:
-            group = new_seed_dirs(place, range(config.seed, config.seed + seeds))
-    assert place is not None  # a group is found in a directory that was named
-    runs = [(replace(config, seed=seed), of_seed) for seed, of_seed in group.items()]
-    runs = runs or [(config, place)]
-    with all_begun(runs, resume):
+    place, runs = runs_at(config, config_stem(path), run, seeds, resume)
+    cause = "--seed with a directory of several seeds"
+    require(not resume or len(runs) == 1 or "seed" not in args, cause, "leave it away")
+    with all_begun(runs, resume, place):
         stop = StopSignal()  # before the imports that take seconds
         try:
             return _in_console(runs, place, stop, resume)
@@ -140,11 +118,11 @@ def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, re
         for config, _ in runs
     ]
     outcome, *_ = trainer.train_seeds(
-        [config for config, _ in runs],
-        [run for _, run in runs],
-        [loggers_of(console, run[0]) for console, run in zip(consoles, runs, strict=True)],
-        stop,
-        resume,
+        configs=[config for config, _ in runs],
+        run_dirs=[run for _, run in runs],
+        loggers=[loggers_of(console, run[0]) for console, run in zip(consoles, runs, strict=True)],
+        stop=stop,
+        resume=resume,
     )
     console = consoles[0]
     if outcome.is_finished:

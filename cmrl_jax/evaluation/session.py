@@ -75,6 +75,7 @@ class TrainingProgram:
         init, iteration = algorithm.init, algorithm.make_iteration(goals)
         shapes = jax.eval_shape(init, jax.random.key(0))
         self._axes = None
+        self._gradient_steps = algorithm.gradient_steps
         if seeds == 1:
             self.one = self.abstract = parallel.placed(shapes, mesh)
         else:
@@ -84,11 +85,14 @@ class TrainingProgram:
             iteration = parallel.over_seeds(iteration, mesh, axes)
             shapes_of_all = jax.eval_shape(init, jax.random.split(jax.random.key(0), seeds))
             self.one, self._axes = shapes, axes
+            count = algorithm.gradient_steps
+            self._gradient_steps = jax.vmap(count, in_axes=(axes,), axis_size=seeds)
             self.abstract = parallel.placed_seeds(shapes_of_all, mesh, axes)
             mesh = None  # lanes are not split as well
         places = jax.tree.map(lambda leaf: leaf.sharding, self.abstract)
         # A program of its own, so that every leaf has a buffer: the iteration donates them all.
         self._init = jit_once(init, out_shardings=places)
+        self._put = jit_once(self._put_seed, donate_argnums=0, out_shardings=places)
         with parallel.using(mesh):
             # Traced once, for the columns and for the program: tracing the physics takes seconds.
             program = jit_repeated(iteration, donate_argnums=0, out_shardings=(places, None))
@@ -111,13 +115,22 @@ class TrainingProgram:
         take = lambda axis, leaf: leaf if axis is None else leaf[index]
         return jax.tree.map(take, self._axes, state, is_leaf=lambda axis: axis is None)
 
-    def of_all(self, states: Sequence[RunState]) -> RunState:
-        """The inverse of `of_seed`: the state of all seeds."""
+    def with_seed(self, state: Any, index: int, one: RunState) -> RunState:
+        """The state with that of one seed in its place; `state` is donated.
+
+        What is in step is taken from `one`.
+        """
         if self._axes is None:
-            return states[0]
-        join = lambda axis, *leaves: leaves[0] if axis is None else jnp.stack(leaves)
-        state = jax.tree.map(join, self._axes, *states, is_leaf=lambda axis: axis is None)
-        return jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), state, self.abstract)
+            return one
+        return self._put(state, index, one)
+
+    def gradient_steps(self, state: RunState) -> np.ndarray:
+        """Gradient steps applied, of each seed."""
+        return np.reshape(self._gradient_steps(state), self.seeds)
+
+    def _put_seed(self, state: RunState, index: jax.Array, one: RunState) -> RunState:
+        put = lambda axis, leaf, new: new if axis is None else leaf.at[index].set(new)
+        return jax.tree.map(put, self._axes, state, one, is_leaf=lambda axis: axis is None)
 
     @property
     def is_compiled(self) -> bool:

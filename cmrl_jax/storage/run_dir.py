@@ -12,12 +12,14 @@ import errno
 import os
 import re
 import socket
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from cmrl_jax.commands import command, quoted
 from cmrl_jax.config.files import check_resumable, read_yaml, to_yaml
-from cmrl_jax.config.schema import Config, ConfigError, call_envs
+from cmrl_jax.config.rules import validate
+from cmrl_jax.config.schema import Config, ConfigError, call_envs, require
 from cmrl_jax.storage.locks import lock
 from envs.command_line import brief, what_is
 
@@ -27,6 +29,7 @@ LOCK = ".lock"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO)
 _TIME = r"\d{8}-\d{6}(-\d+)?"
+_SEED = re.compile(r"seed(\d+)")  # of several in one directory
 
 
 def holds_run(path: Path) -> bool:
@@ -37,17 +40,19 @@ def holds_run(path: Path) -> bool:
 def config_stem(path: Path) -> str:
     """What runs of a config file are called: `ml4` for configs/ml4.yaml.
 
-    A run's own `runs/ml4-<time>/config.yaml` belongs to `ml4` too.
+    A run's own `runs/ml4-<time>/config.yaml`, or one of its seeds', belongs to `ml4` too.
     """
     if path.name == "config.yaml" and holds_run(path.parent):
-        return re.sub(f"-{_TIME}$", "", path.resolve().parent.name)
+        run = path.resolve().parent
+        return re.sub(f"-{_TIME}$", "", (run.parent if _SEED.fullmatch(run.name) else run).name)
     return path.stem
 
 
 def runs_of(stem: str, root: Path = ROOT) -> list[Path]:
-    """Run directories of a config, oldest first."""
+    """Directories of a config's runs, or of several seeds of it, oldest first."""
     name = re.compile(f"{re.escape(stem)}-{_TIME}")
-    found = [p for p in root.glob("*") if name.fullmatch(p.name) and holds_run(p)]
+    named = [p for p in root.glob("*") if name.fullmatch(p.name)]
+    found = [p for p in named if holds_run(p) or seed_dirs(p)]
     return sorted(found, key=_age)
 
 
@@ -67,6 +72,9 @@ def find_run(path: Path) -> Path:
     call_envs(lambda: what_is(path / RUN_FILES[0]))
     if holds_run(path):
         return path
+    if group := seed_dirs(path):
+        names = ", ".join(quoted(run) for run in group.values())
+        raise ConfigError(f"{brief(path)} holds {len(group)} seeds", f"give --run one of: {names}")
     known = [quoted(p) for p in sorted(ROOT.glob("*")) if holds_run(p)][-5:]
     state = "holds no run" if path.is_dir() else "does not exist"
     train = f"train first: {command('--config', 'ml4.yaml')}"
@@ -75,13 +83,13 @@ def find_run(path: Path) -> Path:
 
 
 def resumed_run(stem: str, run: Path | None) -> Path:
-    """The directory to resume: `run`, or the newest one of the config.
+    """The directory to resume: `run`, or the newest one of the config; also one of several seeds.
 
     Raises:
         ConfigError: where there is none.
     """
     if run is not None:
-        return find_run(run)
+        return run if seed_dirs(run) else find_run(run)
     runs = runs_of(stem)
     if not runs:
         cause = f"--resume found no run of '{stem}' in {ROOT}/"
@@ -90,22 +98,50 @@ def resumed_run(stem: str, run: Path | None) -> Path:
 
 
 def seed_dirs(base: Path) -> dict[int, Path]:
-    """The runs of several seeds that lie in one directory, by seed: `base/seed<n>`."""
-    found = {path: re.fullmatch(r"seed(\d+)", path.name) for path in base.glob("seed*")}
-    seeds = {int(match[1]): path for path, match in found.items() if match and holds_run(path)}
-    return dict(sorted(seeds.items()))
+    """The runs of several seeds that lie in one directory, by seed: `base/seed<n>`.
+
+    All are made before one begins, so that a start that was cut short leaves none out.
+    """
+    found = {path: _SEED.fullmatch(path.name) for path in base.glob("seed*") if path.is_dir()}
+    seeds = {int(match[1]): path for path, match in found.items() if match}
+    return dict(sorted(seeds.items())) if any(map(holds_run, found)) else {}
 
 
-def new_seed_dirs(base: Path, seeds: Iterable[int]) -> dict[int, Path]:
-    """Makes the directories of new runs of several seeds in one directory.
+def runs_at(
+    config: Config, stem: str, place: Path | None, seeds: int | None, resume: bool
+) -> tuple[Path, list[tuple[Config, Path]]]:
+    """What is to be trained: a run, or one for each of several seeds, with its directory.
+
+    Args:
+        stem: what new runs are called, or which are looked for.
+        place: directory of the run, or of all seeds.
+        seeds: how many, from `config.seed` on; with `resume` None for those that are there.
+
+    Returns:
+        The directory of all, and the runs.
 
     Raises:
-        ConfigError: where one holds a run already, or cannot be made.
+        ConfigError: as `new_run` and `resumed_run`; or other seeds are there.
     """
-    dirs = {seed: base / f"seed{seed}" for seed in seeds}
-    for run in dirs.values():  # nothing is made if one of them is taken
-        check_unused(run)
-    return {seed: new_run(run.name, run) for seed, run in dirs.items()}
+    if resume:
+        place = resumed_run(stem, place)
+        group = {} if holds_run(place) else seed_dirs(place)
+        there = f"{place} holds {len(group)} seeds" if group else f"{place} holds a single run"
+        cure = f"leave seeds away, or give {len(group)}" if group else "leave seeds away"
+        require(seeds in (None, len(group) or None), f"{there}, not {seeds}", cure)
+        runs = [(replace(config, seed=seed), run) for seed, run in group.items()]
+        return place, runs or [(config, place)]
+    if seeds is None:
+        place = new_run(stem, place)
+        return place, [(config, place)]
+    configs = [replace(config, seed=config.seed + i) for i in range(seeds)]
+    validate(configs[-1])  # the largest seed
+    require(config.checkpoint.keep > 1, "several seeds with checkpoint.keep 1", "keep 2 or more")
+    place = new_run(stem, place)
+    runs = [(one, place / f"seed{one.seed}") for one in configs]
+    for _, run in runs:
+        new_run(run.name, run)
+    return place, runs
 
 
 def new_run(stem: str, run: Path | None, now: datetime.datetime | None = None) -> Path:
@@ -146,7 +182,7 @@ def _made(base: Path) -> Path:
 def check_unused(run: Path) -> None:
     """Raises ConfigError where a directory holds a run already."""
     call_envs(lambda: what_is(run / RUN_FILES[0]))
-    if holds_run(run):
+    if holds_run(run) or seed_dirs(run):
         cause = f"run directory {run} already holds a run"
         cure = "go on with it (--resume, in a program resume=True), or give another --run DIR"
         raise ConfigError(cause, cure)
@@ -168,15 +204,18 @@ def check_same_config(config: Config, run: Path) -> None:
 
 
 @contextlib.contextmanager
-def begun(run: Path, config_yaml: str, resume: bool) -> Iterator[None]:
+def begun(run: Path, config_yaml: str, resume: bool, place: Path | None = None) -> Iterator[None]:
     """Holds a run directory whose `config.yaml` is written: from then on it can be resumed.
 
     A new run that is refused (ValueError) before it wrote anything else is forgotten.
 
+    Args:
+        place: what to resume instead, where it is one of several seeds.
+
     Raises:
         ConfigError: another process writes to it, a write failed, or it holds a run already.
     """
-    with writing_to(run):
+    with writing_to(run, place or run):
         if not resume:
             check_unused(run)  # once more: another process may have come and gone
         write_text(run / "config.yaml", config_yaml)
@@ -189,31 +228,35 @@ def begun(run: Path, config_yaml: str, resume: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def all_begun(runs: Sequence[tuple[Config, Path]], resume: bool) -> Iterator[None]:
+def all_begun(runs: Sequence[tuple[Config, Path]], resume: bool, place: Path) -> Iterator[None]:
     """Holds the directories of several runs, each with the configuration that is its own.
+
+    Args:
+        place: the directory of all.
 
     Raises:
         ConfigError: as `begun`; or one is to be resumed with another configuration.
     """
+    if resume:
+        for config, run in runs:
+            check_same_config(config, run)
     with contextlib.ExitStack() as held:
         for config, run in runs:
-            if resume:
-                check_same_config(config, run)
-            held.enter_context(begun(run, to_yaml(config), resume))
+            held.enter_context(begun(run, to_yaml(config), resume, place))
         yield
 
 
-def cannot_write(run: Path, error: OSError) -> ConfigError:
-    """What to tell a user whose run directory refuses a write."""
+def cannot_write(run: Path, error: OSError, place: Path | None = None) -> ConfigError:
+    """What to tell a user whose run directory refuses a write; `place` is what to resume."""
     cause = f"cannot write to run directory {run}: {error.strerror}"
     if error.errno in DISK_FULL:
-        resume = command("--run", run, "--resume")
+        resume = command("--run", place or run, "--resume")
         return ConfigError(cause, f"make room, then go on from the last checkpoint: {resume}")
     return ConfigError(cause, "give a directory you may write to: --run DIR")
 
 
 @contextlib.contextmanager
-def writing_to(run: Path) -> Iterator[None]:
+def writing_to(run: Path, place: Path | None = None) -> Iterator[None]:
     """Keeps every other process from writing to `run`, and reports what its disk refuses.
 
     Raises:
@@ -236,7 +279,7 @@ def writing_to(run: Path) -> Iterator[None]:
             yield
         except OSError as error:
             if error.errno in (*DISK_FULL, *REFUSED) and _is_inside(error.filename, run):
-                raise cannot_write(run, error) from error
+                raise cannot_write(run, error, place) from error
             raise
 
 

@@ -28,12 +28,14 @@ FREE_AMONG_SEEDS = (
     "checkpoint.",
 )
 
+_SEED = re.compile(r"seed\d+")
 Settings = tuple[tuple[str, Any], ...]
 
 
 def group_name(run: Path) -> str:
-    """What runs of several seeds have in common: `cmrl` for runs/cmrl-seed1."""
-    return re.sub(r"-seed\d+$", "", run.resolve().name)
+    """What runs of several seeds have in common: `cmrl` for runs/cmrl-seed1 and runs/cmrl/seed1."""
+    run = run.resolve()
+    return run.parent.name if _SEED.fullmatch(run.name) else re.sub(r"-seed\d+$", "", run.name)
 
 
 def shown_names(runs: Sequence[Path]) -> list[str]:

@@ -73,7 +73,7 @@ class Run:
             ConfigError: it cannot be gone on from.
         """
         if not self.full.steps():
-            self.check_unsaved(self.run_dir / "metrics.csv")
+            self.check_unsaved()
             self.say(f"{self.run_dir} was stopped before its first save: starting it anew")
             return None
         abstract, versions = split_run(one), package_versions()
@@ -81,28 +81,33 @@ class Run:
             trees, meta = self.full.resume(abstract, self.config, versions)
         else:
             trees, meta = self.full.restore(abstract, self.config, newest, versions)
-            self.full.drop_after(newest)
         check_same_table(self.session.goals, meta["goals_sha256"], self.run_dir)
         return Saved(join_run(one, trees), meta)
 
-    def check_unsaved(self, csv_path: Path) -> None:
+    def check_unsaved(self) -> None:
         """A run saves before its first row: rows without a checkpoint mean that it was lost."""
-        rows = csv_path.read_bytes().count(b"\n") - 1 if csv_path.is_file() else 0
+        rows = self.rows_written()
         if rows > 0 or self.policy.steps():
             raise ConfigError(
                 f"{self.run_dir} has {rows} rows in metrics.csv but no checkpoint in ckpt/",
                 "put ckpt/ back from a copy, or start a new run in another --run DIR",
             )
 
-    def start(self, columns: list[str], saved: Saved | None) -> None:
+    def rows_written(self) -> int:
+        """Rows of metrics.csv, those after the checkpoint too."""
+        path = self.run_dir / "metrics.csv"
+        return path.read_bytes().count(b"\n") - 1 if path.is_file() else 0
+
+    def start(self, columns: list[str], meta: dict[str, Any] | None) -> None:
         """Opens the CSV and starts the loggers, from the beginning or where it was saved."""
         path, wall = self.run_dir / "metrics.csv", 0.0
-        if saved is None:
+        if meta is None:
             self.csv = MetricsCsv(path, columns)
         else:
-            wall, iteration = saved.meta["wall_s"], saved.meta["iteration"]
+            wall, iteration = meta["wall_s"], meta["iteration"]
+            self.csv = MetricsCsv(path, columns, offset=meta["csv_offset"])
+            self.full.drop_after(iteration)
             self.policy.drop_after(iteration)
-            self.csv = MetricsCsv(path, columns, offset=saved.meta["csv_offset"])
             self.say(f"resuming {self.run_dir} after iteration {iteration}")
         write_versions(self.run_dir / "versions.json")
         for logger in self.loggers:

@@ -20,9 +20,9 @@ import numpy as np
 
 from cmrl_jax import parallel
 from cmrl_jax.algorithms.base import Algorithm, RunState
-from cmrl_jax.config.schema import Config, require
+from cmrl_jax.config.schema import Config, ConfigError, require
 from cmrl_jax.evaluation.scores import fault_warning, format_scores, of_policy, summarise
-from cmrl_jax.evaluation.session import Session, TrainingProgram, prepare_jax
+from cmrl_jax.evaluation.session import Session, prepare_jax
 from cmrl_jax.jax_runtime import free_bytes
 from cmrl_jax.registry import rules_of
 from cmrl_jax.stop import Stop
@@ -30,7 +30,7 @@ from cmrl_jax.storage.checkpoint import full_store, policy_store
 from cmrl_jax.storage.run_dir import write_text
 from cmrl_jax.training.loggers import Logger, Progress
 from cmrl_jax.training.metrics import LEADING_COLUMNS, metric_names, metric_row
-from cmrl_jax.training.run import Run, Saved, steps_of
+from cmrl_jax.training.run import Run, steps_of
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
 
@@ -111,7 +111,8 @@ def train_seeds(
     """Trains runs that differ in their seed alone, all in one program; arguments one a run.
 
     Each leaves what it would leave if it were trained alone. Figures are not equal to the last bit:
-    a product of matrices for several seeds adds up in another order than one for each.
+    a product of matrices for several seeds adds up in another order than one for each. A seed whose
+    gradients or physics are non-finite for good stops all; the others can be gone on with alone.
 
     Raises:
         ConfigError: as `train`.
@@ -122,8 +123,7 @@ def train_seeds(
     if len(configs) == 1:
         rules_of(config).check_devices(parallel.size(mesh))
     session = Session(config)
-    check_memory(session.algorithm, len(configs))
-    program = session.training(mesh, len(configs))
+    check_seeds(session.algorithm, len(configs))
     with contextlib.ExitStack() as stores:
         runs = []
         for config, run_dir, told in zip(configs, run_dirs, loggers, strict=True):
@@ -131,36 +131,44 @@ def train_seeds(
             policy = stores.enter_context(policy_store(run_dir))
             label = f"seed {config.seed}: " if len(configs) > 1 else ""
             runs.append(Run(config, run_dir, session, (full, policy), told, label))
-        return _Training(session, program, runs, stop or Stop()).go(device, resume)
+        return _Training(session, runs, stop or Stop()).go(device, resume)
 
 
-def check_memory(algorithm: Algorithm, seeds: int) -> None:
-    """Raises ConfigError if the states of several seeds would not fit into the devices' memory.
+def check_seeds(algorithm: Algorithm, seeds: int) -> None:
+    """Raises ConfigError unless several seeds divide among the devices and fit into their memory.
 
-    A device holds one more than its own, since what is saved is a copy.
+    A device holds one state more than its own, since what is saved is a copy.
     """
+    if seeds == 1:
+        return
+    devices = parallel.size(parallel.make_mesh())
+    cause = f"{seeds} seeds cannot be divided among {devices} devices"
+    cure = "show another number of devices (CUDA_VISIBLE_DEVICES, JAX_NUM_CPU_DEVICES)"
+    require(seeds % devices == 0, cause, f"{cure}, or --seeds {-(-seeds // devices) * devices}")
     state = jax.eval_shape(algorithm.init, jax.random.key(0))
     each = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-    free, devices = free_bytes(), parallel.size(parallel.make_mesh())
-    if seeds == 1 or free is None:
+    free = free_bytes()
+    if free is None:
         return
     fits = devices * max(free // each - 1, 0)
     cause = f"{seeds} seeds of {each / 2**20:.0f} MiB each do not fit into {free / 2**20:.0f} MiB"
-    cure = f"--seeds {fits}" if fits else "set a smaller train.capacity"
-    require(seeds <= fits, cause, cure)
-    cause = f"{seeds} seeds cannot be divided among {devices} devices"
-    require(seeds % devices == 0, cause, f"--seeds {-(-seeds // devices) * devices}")
+    require(seeds <= fits, cause, f"--seeds {fits}" if fits else "set a smaller train.capacity")
 
 
 class _Stopped(Exception):
     """The final evaluation is left: it was asked to stop."""
 
 
+def _iteration(meta: dict[str, Any] | None) -> int:
+    """Iterations done by a checkpoint's record; 0 before the first save."""
+    return meta["iteration"] if meta else 0
+
+
 class _Training:
     """The loop of one process: the state of all its runs, and what is due after each iteration."""
 
-    def __init__(self, session: Session, program: TrainingProgram, runs: Sequence[Run], stop: Stop):
-        self.session, self.program, self.runs, self.stop = session, program, runs, stop
+    def __init__(self, session: Session, runs: Sequence[Run], stop: Stop):
+        self.session, self.runs, self.stop = session, runs, stop
         self.algorithm, self.config = session.algorithm, session.config
         self.schedule = Schedule.of(self.config)
 
@@ -178,6 +186,7 @@ class _Training:
 
     def train(self, device: str, resume: bool) -> list[Outcome]:
         self.say(f"device: {device}")
+        self.program = self.session.training(parallel.make_mesh(), len(self.runs))
         self.start(resume)
         if self.iterations_left() and not self.stop.requested:
             if not self.program.is_compiled:
@@ -199,32 +208,45 @@ class _Training:
 
     def start(self, resume: bool) -> None:
         """A new state, saved before its first iteration, or the state of the last checkpoint."""
-        saved = [run.saved(self.program.one) if resume else None for run in self.runs]
-        # A process that was killed while it saved leaves some of its runs one save behind.
-        iterations = [found.meta["iteration"] if found else 0 for found in saved]
-        self.done = min(iterations)
-        for i, run in enumerate(self.runs):
-            if iterations[i] > self.done:
-                saved[i] = run.saved(self.program.one, self.done)
-        self.state = self.first_state(saved)
-        self.wall = max((found.meta["wall_s"] for found in saved if found), default=0.0)
-        for run, found in zip(self.runs, saved, strict=True):
-            run.start(self.columns(), found)
+        seeds = [run.config.seed for run in self.runs]
+        state: Any = None
+        metas: list[Any] = [None] * len(self.runs)
+        for i, run in enumerate(self.runs if resume else ()):
+            found = run.saved(self.program.one)
+            if found:  # one after another: memory is asked for one more than there are
+                if state is None and len(seeds) > 1:
+                    state = self.program.init(seeds)
+                state, metas[i] = self.program.with_seed(state, i, found.state), found.meta
+        if state is None:
+            state = self.program.init(seeds)
+        state, metas = self.in_step(state, metas)
+        self.state, self.done = state, max(_iteration(meta) for meta in metas)
+        self.wall = max((meta["wall_s"] for meta in metas if meta), default=0.0)
+        for run, meta in zip(self.runs, metas, strict=True):
+            run.start(self.columns(), meta)
         self.evaluator = self.session.evaluator(policies=len(self.runs))
         self.clock = time.monotonic() - self.wall
         self.save()
 
-    def first_state(self, saved: Sequence[Saved | None]) -> RunState:
-        """The state of all runs: what was saved, and a new one of each that had not saved yet."""
-        program = self.program
-        if all(saved):
-            return program.of_all([found.state for found in saved if found])
-        new = program.init([run.config.seed for run in self.runs])
-        if not any(saved):
-            return new
-        return program.of_all(
-            [found.state if found else program.of_seed(new, i) for i, found in enumerate(saved)]
-        )
+    def in_step(self, state: RunState, metas: list[Any]) -> tuple[RunState, list[Any]]:
+        """Takes runs back that were saved when a process was killed, before it saved the others.
+
+        Raises:
+            ConfigError: they differ because one was gone on with alone.
+        """
+        iterations = [_iteration(meta) for meta in metas]
+        least, most = min(iterations), max(iterations)
+        for i, run in enumerate(self.runs):
+            cause = f"{run.run_dir} has done {iterations[i]} iterations, another seed {most}"
+            cure = "go on with each alone: --run DIR/seedN --resume"
+            require(iterations[i] == most or run.rows_written() >= most, cause, cure)
+        for i, run in enumerate(self.runs):
+            if iterations[i] > least:
+                found = run.saved(self.program.one, least)
+                assert found is not None  # it has a newer one, and keeps two
+                state = self.program.with_seed(state, i, found.state)
+                metas[i] = found.meta
+        return state, metas
 
     def timed(self, what: str, compile: Callable[[], Any]) -> Any:
         """Announces a compile and says how long it took."""
@@ -250,8 +272,7 @@ class _Training:
         seconds = time.monotonic() - started
         self.done += 1
         rows = [self.row(i, metrics, seconds) for i in range(len(self.runs))]
-        for run, row in zip(self.runs, rows, strict=True):
-            run.check_health(row)
+        self.check_health(rows)
         if self.schedule.is_eval_due(self.done):
             rows = [row | found for row, found in zip(rows, self.evaluate(), strict=True)]
         self.wall = time.monotonic() - self.clock
@@ -261,9 +282,30 @@ class _Training:
         if self.is_policy_due() or self.wall - self.saved_at >= 60 * self.config.checkpoint.minutes:
             self.save()
 
+    def check_health(self, rows: list[dict[str, Any]]) -> None:
+        """Warns, and stops where a run cannot recover; the others are saved before."""
+        errors: dict[int, ConfigError] = {}
+        for i, (run, row) in enumerate(zip(self.runs, rows, strict=True)):
+            try:
+                run.check_health(row)
+            except ConfigError as error:
+                errors[i] = error
+        if not errors:
+            return
+        first = next(iter(errors.values()))
+        if len(self.runs) == 1:
+            raise first
+        self.wall = time.monotonic() - self.clock
+        for i, run in enumerate(self.runs):
+            if i not in errors:
+                run.write(rows[i] | {"wall_s": self.wall}, Progress(self.share_done(), math.inf))
+                run.save(self.program.of_seed(self.state, i), self.done, self.wall, False)
+        cure = f"{first.cure}; the other seeds go on alone: --run DIR/seedN --resume"
+        raise ConfigError(first.cause, cure)
+
     def row(self, i: int, metrics: dict[str, Any], seconds: float) -> dict[str, Any]:
         """The figures of an iteration of the i-th run."""
-        gradient_steps = np.ravel(self.algorithm.gradient_steps(self.state))
+        gradient_steps = self.program.gradient_steps(self.state)
         if len(self.runs) > 1:
             metrics = {name: value[i] for name, value in metrics.items()}
         return {

@@ -202,7 +202,7 @@ def step_inputs(carried: np.ndarray, action: np.ndarray) -> np.ndarray:
 
 
 def _positions(carried: np.ndarray, bodies: np.ndarray, sites: np.ndarray) -> list[Any]:
-    """The fields of `Positions` of lanes, numpy float32, from what `_Simulator.read` wrote."""
+    """The fields of `Positions` of lanes, numpy float32, from what `Simulator.read` wrote."""
     gap = np.linalg.norm(bodies[:, 1] - bodies[:, 2], axis=-1)
     exact = (bodies[:, 0], sites[:, 0], sites[:, 1], gap, bodies[:, 3], carried[:, SLIDE])
     return [np.asarray(field, np.float32) for field in exact]

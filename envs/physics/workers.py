@@ -23,6 +23,7 @@ import tempfile
 import threading
 import warnings
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -44,8 +45,8 @@ Scenes = list[tuple[mujoco.MjModel, str, str]]  # arguments of `Simulator`, by s
 
 
 def processors() -> int:
-    """Processors that this process may use: Python's own count, which PYTHON_CPU_COUNT sets."""
-    if hasattr(os, "process_cpu_count"):  # from Python 3.13 on
+    """Processors that this process may use; from Python 3.13 on PYTHON_CPU_COUNT sets it."""
+    if hasattr(os, "process_cpu_count"):
         return vars(os)["process_cpu_count"]() or 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -54,25 +55,36 @@ class Worker:
     """One process and its share of the lanes."""
 
     def __init__(self, scenes_file: int):
-        """Starts it; `scenes_file` is open and holds the pickled `Scenes`."""
-        with tempfile.TemporaryFile() as file:
+        """Starts it; `scenes_file` is open and holds the pickled `Scenes`.
+
+        Raises:
+            OSError: it cannot be started; nothing is left of it.
+        """
+        with contextlib.ExitStack() as ours:
+            file = ours.enter_context(_memory_file())
             file.truncate(SHARE * LANE_BYTES)
             self._memory = mmap.mmap(file.fileno(), SHARE * LANE_BYTES)
             told, self._tell = os.pipe()
-            self._heard, answer = os.pipe()
-            handed = (scenes_file, file.fileno(), told, answer)
-            # The same code as this process runs, and nothing to draw with.
-            root = str(Path(__file__).parents[2])
-            paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", __spec__.name, *map(str, handed)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                pass_fds=handed,
-                env=os.environ | {"PYTHONPATH": paths, "MUJOCO_GL": WITHOUT_GL},
-            )
-            os.close(told)
-            os.close(answer)
+            ours.callback(os.close, told)
+            failed = contextlib.ExitStack()
+            failed.callback(os.close, self._tell)
+            with failed:
+                self._heard, answer = os.pipe()
+                ours.callback(os.close, answer)
+                failed.callback(os.close, self._heard)
+                handed = (scenes_file, file.fileno(), told, answer)
+                # The same code as this process runs, and nothing to draw with.
+                root = str(Path(__file__).parents[2])
+                paths = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-m", __spec__.name, *map(str, handed)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    pass_fds=handed,
+                    env=os.environ | {"PYTHONPATH": paths, "MUJOCO_GL": WITHOUT_GL},
+                    start_new_session=True,  # Ctrl-C is for this process alone, at any time
+                )
+                failed.pop_all()
         self._batch = batch_in(self._memory, SHARE)
 
     @property
@@ -100,8 +112,9 @@ class Worker:
             os.close(pipe)
 
     def close(self) -> int:
-        """Ends it; its exit code."""
+        """Ends it, whoever else holds the pipe; its exit code."""
         self.hang_up()
+        self._process.kill()  # it holds nothing that could be lost
         return self._process.wait()
 
 
@@ -122,21 +135,20 @@ class Workers:
         self._scenes, self._count = scenes, count or processors()
         self._simulators = [Simulator(*scene) for scene in scenes]
         self._workers: list[Worker] = []
-        self._owner: int | None = None  # the process that has started them
+        self._missing = 0  # processes that ended, or could not be started
         self._lock = threading.Lock()  # several devices may ask at once
         atexit.register(self.close)
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._forget)
 
     def simulate(self, batch: Batch, lanes: np.ndarray) -> None:
         """One control step of the given `lanes` of a batch; outputs are written into it.
 
-        A worker that has ended is warned of once; the others take over.
+        A worker that has ended, or cannot be started, is warned of once; the others take over.
         """
         with self._lock:
-            if self._owner != os.getpid():
-                for worker in self._workers:  # after a fork they are the parent's
-                    worker.hang_up()
-                self._start()
             try:
+                self._start(min(self._count - self._missing, len(lanes)) - 1)
                 while len(lanes):
                     size = self.at_once * (1 + len(self._workers))
                     self._round(batch, lanes[:size])
@@ -148,40 +160,60 @@ class Workers:
     def close(self) -> None:
         """Ends the workers; the next batch starts new ones."""
         with self._lock:
-            if self._owner == os.getpid():
-                self._close()
+            self._close()
 
     def pids(self) -> list[int]:
         """Process ids of the workers at hand."""
         return [worker.pid for worker in self._workers]
 
-    def _start(self) -> None:
-        with tempfile.TemporaryFile() as file:
-            pickle.dump(self._scenes, file)
-            file.flush()
-            self._workers = [Worker(file.fileno()) for _ in range(self._count - 1)]
-        self._owner = os.getpid()
+    def _start(self, count: int) -> None:
+        """Starts what is missing of `count` workers."""
+        if len(self._workers) >= count:
+            return
+        try:
+            with _memory_file() as file:
+                pickle.dump(self._scenes, file)
+                file.flush()
+                while len(self._workers) < count:
+                    self._workers.append(Worker(file.fileno()))
+        except OSError as error:
+            self._missing = self._count - 1 - len(self._workers)
+            cause = f"no more processes can simulate ({error.strerror}); those at hand go on"
+            warnings.warn(cause, stacklevel=1)
 
     def _round(self, batch: Batch, lanes: np.ndarray) -> None:
         # Dealt out: lanes of a task, which cost alike, go to different ones.
-        count = 1 + len(self._workers)
+        count = min(1 + len(self._workers), len(lanes))
         own, *others = (lanes[first::count] for first in range(count))
-        shares = list(zip(self._workers, others, strict=True))
+        shares = list(zip(self._workers, others, strict=False))
         for worker, share in shares:
             worker.begin(batch, share)
         simulate(self._simulators, batch, own.tolist())
         for worker, share in shares:
             if not worker.finish(batch, share):
                 self._workers.remove(worker)
+                self._missing += 1
                 code = worker.close()
                 cause = f"a process that simulates has ended (exit code {code}); the others go on"
                 warnings.warn(cause, stacklevel=1)
                 simulate(self._simulators, batch, share.tolist())
 
     def _close(self) -> None:
-        for worker in self._workers:
-            worker.close()
-        self._workers, self._owner = [], None
+        while self._workers:
+            self._workers.pop().close()
+
+    def _forget(self) -> None:
+        """After a fork, in the new process: the workers are its parent's."""
+        self._lock = threading.Lock()
+        while self._workers:
+            self._workers.pop().hang_up()
+
+
+def _memory_file() -> IO[bytes]:
+    """A file without a name, in memory where the system has such."""
+    if hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("cmrl"), "w+b")
+    return tempfile.TemporaryFile()
 
 
 def serve(scenes_file: int, memory: int, told: int, answer: int) -> None:
@@ -194,7 +226,8 @@ def serve(scenes_file: int, memory: int, told: int, answer: int) -> None:
     batch = batch_in(mmap.mmap(memory, SHARE * LANE_BYTES), SHARE)
     while lanes := os.read(told, 4):
         simulate(simulators, batch, range(int.from_bytes(lanes)))
-        os.write(answer, DONE)
+        with contextlib.suppress(BrokenPipeError):  # the parent has ended meanwhile
+            os.write(answer, DONE)
 
 
 if __name__ == "__main__":

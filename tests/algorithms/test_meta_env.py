@@ -97,6 +97,12 @@ def test_another_algorithm_trains_resumes_and_is_evaluated(tmp_path):
     assert shown(again.metrics) == shown(whole.metrics)
     scored = cj.evaluate(cj.load_agent(tmp_path / "half"), goals=10)
     assert scored.rows()[0]["return"] >= 8.0
+    first, second = cj.train(config, tmp_path / "two", seeds=2, loggers=lambda config: [])
+    for row, alone in zip(first.metrics, whole.metrics, strict=True):
+        assert row["train/point-right/return"] == pytest.approx(
+            alone["train/point-right/return"], rel=1e-4
+        )
+    assert first.metrics != second.metrics
     with pytest.raises(cj.ConfigError, match="--k 2 with algorithm linear"):
         cj.evaluate(again.agent, k=(2,))
     with pytest.raises(cj.ConfigError, match="--adapt search with algorithm linear"):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -34,13 +35,13 @@ def calls(here, replace_module):
         return lambda *args, **kwargs: made.append((name, args, kwargs)) or result
 
     finished = SimpleNamespace(is_finished=True, wall_s=1.0)
-    trainer = SimpleNamespace(train=recorder("trainer", finished))
+    trainer = SimpleNamespace(train_seeds=recorder("trainer", [finished]))
     replace_module("cmrl_jax.training.trainer", trainer)
     replace_module("cmrl_jax.bench.main", SimpleNamespace(main=recorder("bench", 0)))
     return made
 
 
-def make_run(path: Path, config: str = "ml4.yaml", **flags: str) -> Path:
+def make_run(path: Path, config: str = "ml4.yaml", **flags: Any) -> Path:
     path.mkdir(parents=True)
     (path / "config.yaml").write_text(to_yaml(load_config(config, flags)))
     return path
@@ -55,16 +56,16 @@ def test_bare_config_trains(calls, command):
     assert main([*command, "--config", "pearl.yaml", *flags]) == 0
     [(name, args, kwargs)] = calls
     assert (name, args) == ("trainer", ())
-    config = kwargs["config"]
+    [config], [run] = kwargs["configs"], kwargs["run_dirs"]
     assert (config.train.env_steps, config.sac.batch, config.seed) == (100, 64, 7)
     assert kwargs["resume"] is False
-    assert kwargs["run_dir"].is_dir() and kwargs["run_dir"].parent == Path("runs")
-    assert kwargs["run_dir"].name.startswith("pearl-2")
+    assert run.is_dir() and run.parent == Path("runs")
+    assert run.name.startswith("pearl-2")
 
 
 def test_run_directory_of_ones_own(calls):
     assert main(["--config", "ml4.yaml", "--run", "a/b"]) == 0
-    assert calls[0][2]["run_dir"] == Path("a/b") and Path("a/b").is_dir()
+    assert calls[0][2]["run_dirs"] == [Path("a/b")] and Path("a/b").is_dir()
 
 
 def test_run_directory_that_holds_a_run_needs_resume(calls, refused, here):
@@ -74,7 +75,7 @@ def test_run_directory_that_holds_a_run_needs_resume(calls, refused, here):
     assert main(["--config", "ml4.yaml", "--run", "r", "--resume"]) == 0
     assert main(["--run", "r", "--resume"]) == 0  # its own config
     for _, _, kwargs in calls:
-        assert (kwargs["run_dir"], kwargs["resume"]) == (Path("r"), True)
+        assert (kwargs["run_dirs"], kwargs["resume"]) == ([Path("r")], True)
 
 
 def test_resume_takes_the_newest_run_of_that_config(calls, refused, here):
@@ -86,9 +87,17 @@ def test_resume_takes_the_newest_run_of_that_config(calls, refused, here):
     (here / "runs" / "ml4-20260105-000000").mkdir()  # nothing was written yet
     assert main(["--config", "ml4.yaml", "--resume"]) == 0
     newest = Path("runs/ml4-20260103-000000-2")
-    assert calls[0][2]["run_dir"] == newest
+    assert calls[0][2]["run_dirs"] == [newest]
     assert main(["--config", str(newest / "config.yaml"), "--resume"]) == 0
-    assert calls[1][2]["run_dir"] == newest
+    assert calls[1][2]["run_dirs"] == [newest]
+    seeds = here / "runs" / "ml4-20260106-000000"
+    for seed in (3, 4):
+        make_run(seeds / f"seed{seed}", seed=seed)
+    assert main(["--config", "ml4.yaml", "--resume"]) == 0
+    assert [config.seed for config in calls[2][2]["configs"]] == [3, 4]
+    assert main(["--config", str(newest / "config.yaml")]) == 0
+    assert main(["--config", str(seeds / "seed4" / "config.yaml")]) == 0
+    assert calls[4][2]["run_dirs"][0].name.startswith("ml4-2")
 
 
 def test_resume_refuses_a_changed_field_by_name(calls, refused, here):
@@ -173,7 +182,7 @@ def test_other_exceptions_keep_their_traceback(calls, replace_module):
     def broken(**kwargs):
         raise ValueError("a bug of ours")
 
-    replace_module("cmrl_jax.training.trainer", SimpleNamespace(train=broken))
+    replace_module("cmrl_jax.training.trainer", SimpleNamespace(train_seeds=broken))
     with pytest.raises(ValueError, match="a bug of ours"):
         main(["--config", "ml4.yaml"])
 

@@ -46,7 +46,7 @@ def test_a_shell_reads_back_what_was_meant(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_commands_to_go_on_with_a_run_are_quoted(name, replace_module, capsys):
     outcome = SimpleNamespace(is_finished=False, iteration=3)
-    replace_module("cmrl_jax.training.trainer", SimpleNamespace(train_seeds=lambda *_: [outcome]))
+    replace_module("cmrl_jax.training.trainer", SimpleNamespace(train_seeds=lambda **_: [outcome]))
     assert train._in_console([(Config(), Path(name))], Path(name), Stop(), False) == 0
     stopped = capsys.readouterr().out.partition("go on with: ")[2]
     error = run_dir.cannot_write(Path(name), OSError(errno.ENOSPC, "No space left on device"))

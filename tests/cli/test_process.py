@@ -133,6 +133,7 @@ def test_a_run_with_its_output_on_a_full_disk_saves_and_says_so(tmp_path):
     assert cure.startswith("fix: ") and steps(run) == [0]
 
 
+@pytest.mark.slow
 def test_a_run_without_standard_streams_is_the_undisturbed_one(undisturbed, tmp_path):
     """Closed, not sent to /dev/null: a file would get the number of standard error."""
     run = tmp_path / "run"

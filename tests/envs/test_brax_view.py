@@ -63,6 +63,7 @@ def test_auto_reset_starts_a_fresh_episode_with_another_goal(no_physics):
     np.testing.assert_array_equal(states.info["last_obs"][running], states.obs[running])
 
 
+@pytest.mark.slow
 def test_without_auto_reset_the_last_state_stays(no_physics):
     env = envs.make("drawer-close", horizon=HORIZON, auto_reset=False, goal_observable=True)
     start, states = episodes(env)

@@ -1,6 +1,7 @@
 """The MJX backend against MuJoCo C: single steps, and what stops the hand."""
 
 import numpy as np
+import pytest
 from env_fixtures import GOALS, LANE_GOALS, LANE_TASKS, LANES
 
 from envs.parity import parts as parity_parts
@@ -35,6 +36,7 @@ PATHS = {
 WAY, PUSH, REST = 60, 60, 15  # control steps; in the last of them the hand rests
 
 
+@pytest.mark.slow
 def test_single_steps_are_mujocos(port, rollouts):
     """Without contact to float32; with contact up to the gripper's shape (see README)."""
     for task, result in zip(TASKS, parity_parts.measure_injected(port, rollouts), strict=True):

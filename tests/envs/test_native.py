@@ -1,5 +1,5 @@
 """The native backend against Meta-World's own environments, and what a host callback must not do:
-depend on threads, on the order of lanes or on what it was called with before. The fault test runs
+depend on processes, on the order of lanes or on what it was called with before. The fault test runs
 on both backends.
 """
 

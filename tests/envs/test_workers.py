@@ -91,6 +91,29 @@ def test_lanes_that_were_not_given_are_left_alone(pool):
     np.testing.assert_array_equal(batch.carried[4:], before.carried[4:])
 
 
+def test_a_few_lanes_start_no_more_processes_than_lanes(expected):
+    pool, batch = Workers(scenes(), 4), some_batch()
+    pool.simulate(batch, np.arange(1))
+    assert pool.pids() == []
+    pool.simulate(batch, np.arange(1, 3))
+    assert len(pool.pids()) == 1
+    pool.close()
+
+
+def test_what_cannot_be_started_is_warned_of_once(expected, monkeypatch):
+    pool = Workers(scenes(), 3)
+
+    def refused(*args, **options):
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    before = len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(workers.subprocess, "Popen", refused)
+    with pytest.warns(UserWarning, match="no more processes can simulate .Resource temp"):
+        assert_same(simulated(pool), expected)
+    assert_same(simulated(pool), expected)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_what_stops_a_run_does_not_stop_its_workers(pool, expected, name):
     assert_same(simulated(pool), expected)
@@ -163,11 +186,16 @@ def test_workers_end_with_their_parent(how):
 
 def test_a_forked_process_has_workers_of_its_own():
     parent, pids = started("""
+idle = os.fork()
+if not idle:
+    time.sleep(100)  # it holds what its parent held, and must not keep the workers waiting
 child = os.fork()
 assert_same(simulated(pool), first)
 if child:
     code = os.waitpid(child, 0)[1]
     assert_same(simulated(pool), first)
+    pool.close()
+    os.kill(idle, signal.SIGKILL)
     sys.exit(code != 0)
 print(*pool.pids(), flush=True)
 pool.close()

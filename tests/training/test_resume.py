@@ -29,6 +29,7 @@ def train_in_new_process(run, *words):
     return done.stdout
 
 
+@pytest.mark.slow
 def test_resume_in_a_new_process_equals_an_undisturbed_run(undisturbed, tmp_path):
     run = tmp_path / "run"
     train_in_new_process(run, *native(HALF))

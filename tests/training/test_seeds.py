@@ -14,6 +14,7 @@ import cmrl_jax as cj
 from cmrl_jax.cli.main import main
 from cmrl_jax.storage.checkpoint import full_store
 from cmrl_jax.training import trainer
+from cmrl_jax.training.run import Run
 
 FLAGS = native(3)
 
@@ -87,6 +88,48 @@ def test_one_of_them_goes_on_alone(together, left, tmp_path):
     assert_close(training_rows(run), training_rows(together / "seed1"))
 
 
+def stopped(capsys, *words):
+    """Cause and cure of a command that had begun to speak."""
+    capsys.readouterr()
+    assert main(list(words)) == 2
+    cause, cure = capsys.readouterr().err.splitlines()
+    return cause.removeprefix("error: "), cure
+
+
+def test_a_seed_that_went_on_alone_is_not_taken_back(left, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(left, run)
+    assert main(["--run", str(run / "seed1"), "--resume", "--train.env_steps", "1800"]) == 0
+    before = rows_of(run / "seed1")
+    cause, cure = stopped(capsys, "--run", str(run), "--resume", "--train.env_steps", "2400")
+    assert "has done 2 iterations, another seed 3" in cause and "seedN" in cure
+    assert rows_of(run / "seed1") == before
+    with full_store(run / "seed1", read_only=True) as store:
+        assert store.steps()[-1] == 3
+
+
+def test_one_that_diverges_stops_all_and_loses_nothing_of_the_others(
+    together, left, tmp_path, capsys, monkeypatch
+):
+    run, healthy = tmp_path / "run", Run.check_health
+    shutil.copytree(left, run)
+
+    def check(self, row):
+        healthy(self, row)
+        if self.config.seed == 1:
+            raise cj.ConfigError("seed 1: every gradient was non-finite", "lower sac.lr")
+
+    monkeypatch.setattr(Run, "check_health", check)
+    cause, cure = stopped(capsys, "--run", str(run), "--resume", "--train.env_steps", "1800")
+    assert cause.startswith("seed 1: ") and "--run DIR/seedN --resume" in cure
+    assert training_rows(run / "seed0") == training_rows(together / "seed0")
+    saved = []
+    for seed in ("seed0", "seed1"):
+        with full_store(run / seed, read_only=True) as store:
+            saved.append(store.steps()[-1])
+    assert saved == [3, 2]
+
+
 def training_rows(run):
     """The rows without evaluations, which are due when the schedule says so."""
     is_training = lambda name: not name.startswith("eval/")
@@ -115,9 +158,17 @@ def test_mistakes_are_refused_in_one_line(together, left, tmp_path, refused):
     words = smoke_words(tmp_path / "run", *FLAGS)
     assert "--seeds" in refused(*words, "--seeds", "0")[0]
     cause, cure = refused("--run", str(together), "--resume", "--seeds", "3")
-    assert "holds 2 seeds, not 3" in cause and "--seeds 2" in cure
-    cause, _ = refused(*smoke_words(together, *FLAGS, "--seeds", "2"))
-    assert "already holds a run" in cause
+    assert "holds 2 seeds, not 3" in cause and "give 2" in cure
+    for more in ((), ("--seeds", "2"), ("--seed", "7", "--seeds", "2")):
+        cause, _ = refused(*smoke_words(together, *FLAGS, *more))
+        assert "already holds a run" in cause
+    cause, cure = refused("eval", "--run", str(together))
+    assert "holds 2 seeds" in cause and "seed1" in cure
+    assert "--seed" in refused("--run", str(together), "--resume", "--seed", "7")[0]
+    largest = str(2**31 - 1)
+    assert "seed" in refused(*words, "--seed", largest, "--seeds", "2")[0]
+    assert "checkpoint.keep" in refused(*words, "--checkpoint.keep", "1", "--seeds", "2")[0]
+    assert not (tmp_path / "run").exists()
     shared = [cj.Logger()]
     with pytest.raises(cj.ConfigError, match="shared by 2 seeds"):
         cj.train(cj.load_config("smoke.yaml"), tmp_path / "x", seeds=2, loggers=shared)  # type: ignore[call-overload]

@@ -179,13 +179,11 @@ def test_evaluation_does_not_depend_on_what_was_evaluated_before_or_beside(undis
     np.testing.assert_allclose(alone[1].returns[:, :, 0], first[1].returns[:, :, 0], rtol=1e-4)
 
 
-PRESETS = ("pearl",)  # the others are of its parts or smoke.yaml's, or larger
-SLOW = ("mtsac", "sac", "ml4", "ml4-plain", "cmrl-paper", "ml4-large")
+PRESETS = ("pearl", "mtsac", "sac", "ml4", "ml4-plain", "cmrl-paper", "ml4-large")
 
 
-@pytest.mark.parametrize(
-    "preset", [*PRESETS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", PRESETS)
 def test_each_preset_runs_two_iterations_at_smoke_size(preset):
     config = load_config(f"{preset}.yaml")
     small = load_config("smoke.yaml")
