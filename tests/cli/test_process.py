@@ -232,9 +232,9 @@ def test_a_run_that_came_before_the_lock_is_not_overwritten(
     run, files = tmp_path / "run", ("config.yaml", "metrics.csv")
 
     @contextlib.contextmanager
-    def late(path):
+    def late(path, place):
         shutil.copytree(undisturbed, path, dirs_exist_ok=True)
-        with writing_to(path):
+        with writing_to(path, place):
             yield
 
     monkeypatch.setattr(run_dir, "writing_to", late)
