@@ -89,12 +89,12 @@ def placed_seeds(shapes: Any, mesh: Mesh | None, axes: Any) -> Any:
     if mesh is None:
         return shapes
 
-    def place(leaf: Any, spec: PartitionSpec) -> jax.ShapeDtypeStruct:
+    def place(leaf: Any, spec: PartitionSpec) -> Any:
+        if leaf is None:
+            return None
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=NamedSharding(mesh, spec))
 
-    is_none = lambda part: part is None
-    put = lambda leaf, spec: None if leaf is None else place(leaf, spec)
-    return jax.tree.map(put, shapes, _specs(axes), is_leaf=is_none)
+    return jax.tree.map(place, shapes, _specs(axes), is_leaf=lambda part: part is None)
 
 
 def _specs(axes: Any) -> Any:

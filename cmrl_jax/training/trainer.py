@@ -66,7 +66,7 @@ class Schedule:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a call of `train` ended; everything is saved.
+    """How a run ended; everything is saved.
 
     Attributes:
         iteration: iterations done.
@@ -81,26 +81,6 @@ class Outcome:
     wall_s: float
 
 
-def train(
-    config: Config,
-    run_dir: Path,
-    loggers: Sequence[Logger] = (),
-    stop: Stop | None = None,
-    resume: bool = False,
-) -> Outcome:
-    """Trains to the end of the schedule, or to a stop.
-
-    Args:
-        run_dir: its `config.yaml` is written, and it is held (`run_dir.begun`).
-        loggers: are started and closed here.
-        stop: is looked at between iterations, and in the last evaluation.
-
-    Raises:
-        ConfigError: anything the user can mend, before the first compile where possible.
-    """
-    return train_seeds([config], [run_dir], [loggers], stop, resume)[0]
-
-
 def train_seeds(
     configs: Sequence[Config],
     run_dirs: Sequence[Path],
@@ -108,14 +88,20 @@ def train_seeds(
     stop: Stop | None = None,
     resume: bool = False,
 ) -> list[Outcome]:
-    """Trains runs that differ in their seed alone, all in one program; arguments one a run.
+    """Trains to the end of the schedule, or to a stop: one run, or several that differ in their
+    seed alone, all in one program.
 
     Each leaves what it would leave if it were trained alone. Figures are not equal to the last bit:
     a product of matrices for several seeds adds up in another order than one for each. A seed whose
     gradients or physics are non-finite for good stops all; the others can be gone on with alone.
 
+    Args:
+        configs, run_dirs, loggers: one a run. The `config.yaml` of a directory is written, and it
+            is held (`run_dir.begun`); loggers are started and closed here.
+        stop: is looked at between iterations, and in the last evaluation.
+
     Raises:
-        ConfigError: as `train`.
+        ConfigError: anything the user can mend, before the first compile where possible.
     """
     # All that refuses a configuration stands before the stores: they are what makes a run begin.
     config, device = configs[0], prepare_jax(configs[0])
@@ -222,8 +208,9 @@ class _Training:
         state, metas = self.in_step(state, metas)
         self.state, self.done = state, max(_iteration(meta) for meta in metas)
         self.wall = max((meta["wall_s"] for meta in metas if meta), default=0.0)
+        columns = self.columns()
         for run, meta in zip(self.runs, metas, strict=True):
-            run.start(self.columns(), meta)
+            run.start(columns, meta)
         self.evaluator = self.session.evaluator(policies=len(self.runs))
         self.clock = time.monotonic() - self.wall
         self.save()
@@ -271,7 +258,8 @@ class _Training:
         metrics = jax.tree.map(np.asarray, metrics)
         seconds = time.monotonic() - started
         self.done += 1
-        rows = [self.row(i, metrics, seconds) for i in range(len(self.runs))]
+        gradient_steps = self.program.gradient_steps(self.state)
+        rows = [self.row(i, metrics, int(n), seconds) for i, n in enumerate(gradient_steps)]
         self.check_health(rows)
         if self.schedule.is_eval_due(self.done):
             rows = [row | found for row, found in zip(rows, self.evaluate(), strict=True)]
@@ -303,15 +291,16 @@ class _Training:
         cure = f"{first.cure}; the other seeds go on alone: --run DIR/seedN --resume"
         raise ConfigError(first.cause, cure)
 
-    def row(self, i: int, metrics: dict[str, Any], seconds: float) -> dict[str, Any]:
+    def row(
+        self, i: int, metrics: dict[str, Any], gradient_steps: int, seconds: float
+    ) -> dict[str, Any]:
         """The figures of an iteration of the i-th run."""
-        gradient_steps = self.program.gradient_steps(self.state)
         if len(self.runs) > 1:
             metrics = {name: value[i] for name, value in metrics.items()}
         return {
             "iteration": self.done - 1,
             "env_steps": self.done * self.schedule.steps_per_iteration,
-            "gradient_steps": int(gradient_steps[i]),
+            "gradient_steps": gradient_steps,
             "seed": self.runs[i].config.seed,
             "time/iteration_s": seconds,
             "time/env_steps_per_s": self.schedule.steps_per_iteration / seconds,
