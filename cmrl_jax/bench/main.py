@@ -52,6 +52,15 @@ class Report:
             "rows": [],
         }
 
+    @property
+    def device(self) -> str:
+        """What the rows were measured on."""
+        return self._document["device"]
+
+    @device.setter
+    def device(self, name: str) -> None:
+        self._document["device"] = name
+
     def add(self, name: str, value: float, unit: str, **labels: Any) -> None:
         self._document["rows"].append({"name": name, "value": value, "unit": unit} | labels)
         call_envs(lambda: write_json(self._path, "bench", self._document))

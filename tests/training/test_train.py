@@ -1,7 +1,8 @@
 """The loop end to end at smoke size, through the command line, on real physics.
 
-One run of `smoke.yaml` (module fixture) trains on mjx and is compared with its resumption. What
-does not ask for mjx runs on MuJoCo C, which has nothing to compile; the presets run two iterations.
+One run of `smoke.yaml` (module fixture) trains on mjx, without modules: those compile as long as
+the physics and run in `undisturbed_modular`. What does not ask for mjx runs on MuJoCo C, which has
+nothing to compile; the presets run two iterations.
 """
 
 import dataclasses
@@ -24,6 +25,8 @@ from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.storage.checkpoint import full_store
 from cmrl_jax.text import goal_files
 
+MJX = ("--model.net", "mlp")
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
@@ -39,7 +42,7 @@ def finished(tmp_path_factory):
             return original(self, *args, **kwargs)
 
         patch.setattr(jax.stages.Lowered, "compile", counted)
-        assert smoke(run) == 0
+        assert smoke(run, *MJX) == 0
     return run, len(compiles)
 
 
@@ -85,12 +88,14 @@ def test_the_same_seed_gives_the_same_csv_and_another_seed_does_not(undisturbed,
 
 
 @pytest.mark.slow
-def test_resume_equals_an_undisturbed_run_bit_for_bit(finished, tmp_path):
-    run = tmp_path / "run"
+def test_resume_equals_an_undisturbed_run_bit_for_bit(tmp_path):
+    """With modules and on mjx; `test_resume` has the same without either."""
+    undisturbed, run = tmp_path / "undisturbed", tmp_path / "run"
+    assert smoke(undisturbed) == 0
     assert smoke(run, "--train.env_steps", "600") == 0
     assert len(rows_of(run)) == 1
     assert smoke(run, "--resume") == 0
-    assert_same_result(run, finished[0])
+    assert_same_result(run, undisturbed)
 
 
 def test_a_run_killed_before_its_first_save_resumes_from_the_start(undisturbed, tmp_path):
