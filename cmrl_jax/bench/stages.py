@@ -19,10 +19,11 @@ from envs.physics.mjx.backend import (
     ROBOT_JOINTS,
     SOLVER_ITERATIONS,
     SUBSTEPS,
+    WELD_ROWS,
     MjxPhysics,
 )
 from envs.physics.mjx.quiet import mjx
-from envs.physics.mjx.solver import solve
+from envs.physics.mjx.solver import solve, solve_positive
 from envs.physics.model import JOINTS
 from envs.tasks import TASKS
 from envs.tasks.specs import SCENE_ID
@@ -46,17 +47,16 @@ def bench_stages(lane_counts: tuple[int, ...], report: Report) -> None:
         return data, physics._constraints(state, data, scene)
 
     def with_solver(state: Any, scene: Any) -> jax.Array:
-        data, (weld, limits, cones) = constraints(state, scene)
-        rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), weld, limits)
+        data, (rows, cones) = constraints(state, scene)
         mass = jnp.eye(JOINTS).at[:ROBOT_JOINTS, :ROBOT_JOINTS].set(mjx.full_m(physics.model, data))
         force = jnp.append(data.qfrc_smooth, 0.0)
-        smooth = jnp.append(data.qacc_smooth, 0.0)
-        budget = (weld.weight.shape[0], SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS)
+        smooth = solve_positive(mass, force)
+        budget = (WELD_ROWS, SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS)
         return solve(mass, force, smooth, state.warm_start, rows, cones, *budget)[0]
 
     # Each adds one stage to those before it, and returns something that all of it leads to.
     stages: dict[str, Callable[[Any, Any], jax.Array]] = {
-        "arm": lambda state, scene: total(arm(state, scene).qacc_smooth),
+        "arm": lambda state, scene: total(arm(state, scene).qfrc_smooth),
         "arm+contacts+rows": lambda state, scene: total(constraints(state, scene)[1]),
         "arm+contacts+rows+solver": lambda state, scene: total(with_solver(state, scene)),
     }

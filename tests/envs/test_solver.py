@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import minimize
 
 from envs.physics.mjx.backend import LINE_SEARCH_ITERATIONS, SOLVER_ITERATIONS
-from envs.physics.mjx.solver import Cones, Rows, make_cones, make_rows, solve
+from envs.physics.mjx.solver import Cones, RowGeometry, Rows, make_cones, make_rows, solve
 
 BALL = """
 <mujoco><option timestep="0.0025" cone="elliptic"/>
@@ -62,16 +62,16 @@ def test_rows_and_cones_equal_mujocos(depth, solref, solimp):
     np.testing.assert_allclose(cones.reference[0], aref, rtol=2e-5, atol=1e-4)
     assert limited.sum() == (depth > 0)
     pos = data.qpos[[7]] - depth
-    rows = make_rows(
-        jacobian=jacobian[limited],
-        pos=pos,
-        impedance_pos=pos,
-        invweight=model.dof_invweight0[[6]],
-        solref=np.array([solref]),
-        solimp=np.array([solimp]),
-        active=np.ones(1),
-        **common,
+    geometry: Any = (
+        jacobian[limited],
+        pos,
+        pos,
+        model.dof_invweight0[[6]],
+        np.array([solref]),
+        np.array([solimp]),
+        np.ones(1),
     )
+    rows = make_rows(RowGeometry(*geometry), **common)
     if depth > 0:
         np.testing.assert_allclose(rows.weight, data.efc_D[limited], rtol=2e-5)
         np.testing.assert_allclose(rows.reference, data.efc_aref[limited], rtol=2e-5, atol=1e-4)

@@ -42,16 +42,14 @@ def make_diagnose(config: Config, learner: Learner, goal_vectors: jax.Array) -> 
     def posterior_variance(state: TrainState, ring: Any, key: jax.Array) -> dict[str, jax.Array]:
         if inference is None:
             return {}
-        largest = max(CONTEXT_SIZES)
+        largest, posterior = max(CONTEXT_SIZES), inference.posterior
         context = rings.sample_transitions(ring, key, jnp.arange(num_tasks), largest)
         context = learner.normalized(state.obs_stats, context)
 
         def variance(size: jax.Array) -> jax.Array:
             mask = jnp.broadcast_to(jnp.arange(largest) < size, (num_tasks, largest))
-            posterior = inference.posterior(
-                state.encoder_params, context, mask, goal_vectors[:, 0], jnp.ones(num_tasks)
-            )
-            return jnp.mean(posterior.variance, -1)
+            text = goal_vectors[:, 0], jnp.ones(num_tasks)
+            return jnp.mean(posterior(state.encoder_params, context, mask, *text).variance, -1)
 
         # One pass for all sizes: four would take four times as long to compile.
         by_size = jax.vmap(variance)(jnp.array(CONTEXT_SIZES))

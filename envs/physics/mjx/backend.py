@@ -1,6 +1,6 @@
 """The `mjx` backend: one control step of one lane, MJX for the arm and our own contacts around it.
 
-MJX computes the arm's kinematics, mass matrix, bias and actuation. The fixture is one joint whose
+MJX computes the arm's mass matrix and bias forces. The fixture is one joint whose
 only coupling is contact, so it stays outside the MJX model as a few numbers per lane. Unused MJX
 stages (cameras, tendons, sensors, its collision driver) are skipped.
 """
@@ -18,8 +18,17 @@ from envs.physics.base import Positions, settled_starts
 from envs.physics.mjx import rotations
 from envs.physics.mjx.contact import Contacts, find_contacts
 from envs.physics.mjx.geometry import FixtureShapes, load_gripper, load_shapes
+from envs.physics.mjx.kinematics import Kinematics
 from envs.physics.mjx.quiet import mjx
-from envs.physics.mjx.solver import Cones, Rows, make_cones, make_rows, solve
+from envs.physics.mjx.solver import (
+    Cones,
+    RowGeometry,
+    Rows,
+    make_cones,
+    make_rows,
+    solve,
+    solve_positive,
+)
 from envs.physics.model import (
     ARM_JOINTS,
     FRAME_SKIP,
@@ -39,6 +48,7 @@ from envs.tasks.base import ACTION_SCALE, HAND_HIGH, HAND_LOW
 SUBSTEPS = FRAME_SKIP
 SOLVER_ITERATIONS, LINE_SEARCH_ITERATIONS = 4, 6
 LIMIT_SOLREF, LIMIT_SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)  # MuJoCo defaults
+WELD_ROWS = 6
 WELD_TORQUE_SCALE = 5.0  # SawyerMocapBase.reset_mocap_welds
 
 
@@ -65,7 +75,9 @@ class MjxPhysics:
     def __init__(self) -> None:
         full = {scene: load_scene(scene) for scene in SCENES}
         drawer = full["drawer"]
-        self.model = mjx.put_model(arm_model(drawer))
+        arm = arm_model(drawer)
+        self.model = mjx.put_model(arm)
+        self._kinematics = Kinematics(arm)
         self.timestep = float(drawer.opt.timestep)
         self._data = mjx.make_data(self.model)
         self._gripper = jax.tree.map(_float32, load_gripper(drawer))
@@ -96,6 +108,8 @@ class MjxPhysics:
         self._tip = [_float32(rot.T @ (data.site(n).xpos - link.xpos)) for n in tips]
         self._dof_invweight = model.dof_invweight0[:ROBOT_JOINTS].copy()
         self._joint_range = model.jnt_range[:ROBOT_JOINTS].copy()
+        self._servo_gain = _float32(model.actuator_gainprm[:, 0])
+        self._servo_bias = _float32(model.actuator_biasprm[:, 1])
 
     def scene(self, scene_id: jax.Array) -> SceneData:
         """The numbers of one scene, by index into `SCENES`."""
@@ -143,7 +157,7 @@ class MjxPhysics:
         """Positions after kinematics, as Meta-World reads them after `mj_forward`."""
         scene = self.scene(scene_id)
         data = self._data.replace(qpos=state.qpos[:ROBOT_JOINTS])
-        data = mjx.kinematics(self.model, data)
+        data = self._kinematics(data)
         pos, rot = data.xpos[ARM_JOINTS], data.xmat[ARM_JOINTS]
         fingers, axes = state.qpos[RIGHT_FINGER : LEFT_FINGER + 1], self._gripper.finger_axis
         moved = [
@@ -174,9 +188,8 @@ class MjxPhysics:
         # The slides are horizontal: gravity does no work on a fixture, damping is all it has.
         slide_force = -fixture.damping * state.qvel[SLIDE]
         force = jnp.append(data.qfrc_smooth, slide_force)
-        smooth = jnp.append(data.qacc_smooth, slide_force / fixture.inertia)
-        weld, limits, cones = _fence(self._constraints(state, data, scene))
-        rows = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), weld, limits)
+        smooth = solve_positive(mass, force)
+        rows, cones = _fence(self._constraints(state, data, scene))
         acceleration, constraint_force = solve(
             mass,
             force,
@@ -184,35 +197,36 @@ class MjxPhysics:
             state.warm_start,
             rows,
             cones,
-            weld.weight.shape[0],
+            WELD_ROWS,
             SOLVER_ITERATIONS,
             LINE_SEARCH_ITERATIONS,
         )
         # Euler with implicit joint damping, as mj_Euler: (M + h D) a = forces.
         damping = jnp.append(self.model.dof_damping, fixture.damping)
-        implicit = jax.scipy.linalg.cho_factor(mass + jnp.diag(self.timestep * damping))
-        step = jax.scipy.linalg.cho_solve(implicit, force + constraint_force)
+        implicit = mass + jnp.diag(self.timestep * damping)
+        step = solve_positive(implicit, force + constraint_force)
         qvel = state.qvel + self.timestep * step
         return state.replace(
             qpos=state.qpos + self.timestep * qvel, qvel=qvel, warm_start=acceleration
         )
 
     def _smooth_dynamics(self, data: mjx.Data) -> mjx.Data:
-        """The arm without constraints: MJX's own stages up to qacc_smooth."""
+        """The arm without constraints: poses, then MJX's own stages up to its forces."""
         model = self.model
-        data = mjx.kinematics(model, data)
+        data = self._kinematics(data)
         data = mjx.com_pos(model, data)
         data = mjx.crb(model, data)
-        data = mjx.factor_m(model, data)
-        data = mjx.transmission(model, data)
         data = mjx.fwd_velocity(model, data)
-        data = mjx.fwd_actuation(model, data)
-        return mjx.fwd_acceleration(model, data)
+        # Of all that MJX adds up here only the fingers' servos are not zero.
+        fingers = slice(ARM_JOINTS, ROBOT_JOINTS)
+        servo = self._servo_gain * data.ctrl + self._servo_bias * data.qpos[fingers]
+        force = (data.qfrc_passive - data.qfrc_bias).at[fingers].add(servo)
+        return data.replace(qfrc_smooth=force)
 
     def _constraints(
         self, state: PhysicsState, data: mjx.Data, scene: SceneData
-    ) -> tuple[Rows, Rows, Cones]:
-        """The weld of the hand, the limits, and the contacts."""
+    ) -> tuple[Rows, Cones]:
+        """The weld of the hand and the limits as rows, and the contacts."""
         pos, rot = data.xpos[ARM_JOINTS], data.xmat[ARM_JOINTS]
         contacts = find_contacts(
             self._gripper,
@@ -223,14 +237,21 @@ class MjxPhysics:
             state.placement,
             state.placement + scene.fixture.axis * state.qpos[SLIDE],
         )
-        return (
-            self._weld_rows(state, data, pos, rot),
-            self._limit_rows(state, scene),
-            self._contact_cones(state, data, scene, _fence(contacts)),
-        )
+        weld, drift = self._weld(state, data, pos, rot)
+        parts = zip(weld, self._limits(state, scene), strict=True)
+        geometry = RowGeometry(*map(jnp.concatenate, parts))
+        rows = make_rows(geometry, state.qvel, self.timestep)
+        rows = rows._replace(reference=rows.reference.at[:WELD_ROWS].add(-drift))
+        return rows, self._contact_cones(state, data, scene, _fence(contacts))
 
-    def _weld_rows(self, state: PhysicsState, data: mjx.Data, pos, rot) -> Rows:
-        """The weld of the hand to the mocap body: three translations, three rotations."""
+    def _weld(
+        self, state: PhysicsState, data: mjx.Data, pos: jax.Array, rot: jax.Array
+    ) -> tuple[RowGeometry, jax.Array]:
+        """The weld of the hand to the mocap body: three translations, three rotations.
+
+        MuJoCo takes the change of the Jacobian into account for equalities, and only there: how
+        much it takes off the reference acceleration is returned too, (6,).
+        """
         hand = pos + rot @ self._hand_pos
         translate, rotate = self._robot_jacobian(data, hand)  # (joint, 3) each
         error = state.mocap - hand
@@ -244,25 +265,22 @@ class MjxPhysics:
         turned = 0.5 * jax.vmap(turn)(-rotate * WELD_TORQUE_SCALE)
         jacobian = jnp.concatenate([-translate.T, turned.T])
         error = jnp.concatenate([error, twist])
-        # MuJoCo takes the change of the Jacobian into account for equalities (and only there).
         speed, linear, angular = self._velocity_product(state, data, hand)
         turning = 0.5 * turn(-angular * WELD_TORQUE_SCALE) - 0.25 * (speed @ speed) * twist
         drift = jnp.concatenate([-linear, turning])
-        ones = jnp.ones(6)
-        rows = make_rows(
+        ones = jnp.ones(WELD_ROWS)
+        rows = RowGeometry(
             jacobian=jnp.pad(jacobian, ((0, 0), (0, 1))),
             pos=error,
             impedance_pos=jnp.linalg.norm(error) * ones,
             invweight=jnp.repeat(jnp.asarray(self._hand_invweight, jnp.float32), 3),
-            solref=jnp.tile(jnp.array(LIMIT_SOLREF), (6, 1)),
-            solimp=jnp.tile(jnp.array(LIMIT_SOLIMP), (6, 1)),
-            qvel=state.qvel,
-            timestep=self.timestep,
+            solref=jnp.tile(jnp.array(LIMIT_SOLREF), (WELD_ROWS, 1)),
+            solimp=jnp.tile(jnp.array(LIMIT_SOLIMP), (WELD_ROWS, 1)),
             active=ones,
         )
-        return rows._replace(reference=rows.reference - drift)
+        return rows, drift
 
-    def _limit_rows(self, state: PhysicsState, scene: SceneData) -> Rows:
+    def _limits(self, state: PhysicsState, scene: SceneData) -> RowGeometry:
         """Ten joint limits, and the two slide positions where the fixture meets a static part."""
         ranges = jnp.concatenate(
             [jnp.asarray(self._joint_range, jnp.float32), scene.fixture.joint_range[None]]
@@ -281,15 +299,13 @@ class MjxPhysics:
             ]
         )
         tile = lambda value: jnp.tile(jnp.array(value), (JOINTS, 1))
-        return make_rows(
+        return RowGeometry(
             jacobian=jnp.eye(JOINTS)[joint] * sign[:, None],
             pos=pos,
             impedance_pos=pos,
             invweight=invweight,
             solref=jnp.concatenate([tile(LIMIT_SOLREF), scene.shapes.stop_solref]),
             solimp=jnp.concatenate([tile(LIMIT_SOLIMP), scene.shapes.stop_solimp]),
-            qvel=state.qvel,
-            timestep=self.timestep,
             active=(pos < 0).astype(jnp.float32),
         )
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from envs.physics.mjx.geometry import BASE_HANDLE_COUNT, FixtureShapes, Gripper, Material
 
@@ -45,8 +46,8 @@ def _take(material: Material, index: jax.Array) -> Material:
     return Material(*(jnp.asarray(leaf)[index] for leaf in material))
 
 
-def _deepest(contacts: Contacts, count: int) -> Contacts:
-    """The `count` contacts deepest beyond their margin; they carry the load of the others.
+def _deepest(contacts: Contacts, count: int) -> jax.Array:
+    """The `count` contacts deepest beyond their margin, packed; they carry the load of the others.
 
     With n points in contact and fewer kept, each kept one is as stiff as n / count of them:
     otherwise a hard push sinks in deeper than the handle is thick, and passes through.
@@ -54,8 +55,19 @@ def _deepest(contacts: Contacts, count: int) -> Contacts:
     depth = contacts.material.margin - contacts.dist
     share = jnp.maximum(jnp.sum(depth > 0) / count, 1.0)
     _, index = jax.lax.top_k(depth, count)
-    kept = jax.tree.map(lambda leaf: leaf[index], contacts)
-    return kept._replace(material=kept.material._replace(invweight=kept.material.invweight / share))
+    softer = contacts.material._replace(invweight=contacts.material.invweight / share)
+    return _packed(contacts._replace(material=softer))[index]
+
+
+def _packed(contacts: Contacts) -> jax.Array:
+    """All numbers of contacts as a table (contact, number), from which one gather takes rows."""
+    return jax.vmap(lambda one: ravel_pytree(one)[0])(contacts)
+
+
+def _unpacked(table: jax.Array, like: Contacts) -> Contacts:
+    """Contacts of a table; `like`: any of the same kind."""
+    _, unravel = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], like))
+    return jax.vmap(unravel)(table)
 
 
 def point_box(point: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -177,10 +189,13 @@ def segment_polytope(
     """
     value, slope = start @ normal.T - offset, along @ normal.T  # (segment, face)
 
+    faces = jnp.broadcast_to(jnp.arange(len(offset)), value.shape)
+
     def steepest(t):
-        face = jnp.argmax(value + t[:, None] * slope, 1)[:, None]
-        pick = lambda x: jnp.take_along_axis(x, face, 1)[:, 0]
-        return face[:, 0], pick(value), pick(slope)
+        """Face, value and slope of the largest plane distance at t, taken in one reduction."""
+        larger = lambda a, b: jax.tree.map(lambda x, y: jnp.where(a[0] >= b[0], x, y), a, b)
+        found = (value + t[:, None] * slope, faces, value, slope)
+        return jax.lax.reduce(found, (-jnp.inf, 0, 0.0, 0.0), larger, (1,))[1:]
 
     def crossing(low, high):
         """Where two lines meet, inside the segment; an end where it descends to that end."""
@@ -304,10 +319,10 @@ def find_contacts(
     )
     kept = (
         _deepest(fingers, FINGER_SLOTS),
-        _without_torsion(_deepest(base, BASE_SLOTS)),
-        _without_torsion(_deepest(boxes, BOX_SLOTS)),
+        _deepest(_without_torsion(base), BASE_SLOTS),
+        _deepest(_without_torsion(boxes), BOX_SLOTS),
     )
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kept)
+    return _unpacked(jnp.concatenate(kept), fingers)
 
 
 def _without_torsion(contacts: Contacts) -> Contacts:

@@ -5,20 +5,28 @@ MJX has the same functions, but none of them is public.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+
+Parts = Sequence[Any] | jax.Array
+
+
+def product(u: Parts, v: Parts) -> list[Any]:
+    """The product of two quaternions by their four parts, numbers or arrays."""
+    return [
+        u[0] * v[0] - u[1] * v[1] - u[2] * v[2] - u[3] * v[3],
+        u[0] * v[1] + u[1] * v[0] + u[2] * v[3] - u[3] * v[2],
+        u[0] * v[2] - u[1] * v[3] + u[2] * v[0] + u[3] * v[1],
+        u[0] * v[3] + u[1] * v[2] - u[2] * v[1] + u[3] * v[0],
+    ]
 
 
 def multiply(u: jax.Array, v: jax.Array) -> jax.Array:
     """The product of two quaternions, (4,) each -> (4,)."""
-    return jnp.stack(
-        [
-            u[0] * v[0] - u[1] * v[1] - u[2] * v[2] - u[3] * v[3],
-            u[0] * v[1] + u[1] * v[0] + u[2] * v[3] - u[3] * v[2],
-            u[0] * v[2] - u[1] * v[3] + u[2] * v[0] + u[3] * v[1],
-            u[0] * v[3] + u[1] * v[2] - u[2] * v[1] + u[3] * v[0],
-        ]
-    )
+    return jnp.stack(product(u, v))
 
 
 def multiply_vector(q: jax.Array, v: jax.Array) -> jax.Array:

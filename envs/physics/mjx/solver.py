@@ -32,6 +32,18 @@ class Rows(NamedTuple):
     reference: jax.Array  # (row,) reference acceleration, MuJoCo's efc_aref
 
 
+class RowGeometry(NamedTuple):
+    """What rows are made of; `pos` drives the reference, `impedance_pos` the impedance."""
+
+    jacobian: jax.Array  # (row, joint)
+    pos: jax.Array  # (row,)
+    impedance_pos: jax.Array  # (row,)
+    invweight: jax.Array  # (row,)
+    solref: jax.Array  # (row, 2)
+    solimp: jax.Array  # (row, 5)
+    active: jax.Array  # (row,) 1.0 where it is
+
+
 class Cones(NamedTuple):
     """Contacts of one lane: normal, two tangents and spin each, scaled by mu, f1, f2, f3."""
 
@@ -56,8 +68,9 @@ def stiffness_damping_impedance(solref, solimp, pos, timestep):
     return stiffness, damping, jnp.clip(impedance, MIN_IMPEDANCE, MAX_IMPEDANCE)
 
 
-def make_rows(jacobian, pos, impedance_pos, invweight, solref, solimp, qvel, timestep, active):
-    """Rows from their geometry: `pos` drives the reference, `impedance_pos` the impedance."""
+def make_rows(geometry: RowGeometry, qvel: jax.Array, timestep: float) -> Rows:
+    """Rows from their geometry, at a joint velocity (joint,)."""
+    jacobian, pos, impedance_pos, invweight, solref, solimp, active = geometry
     k, b, d = stiffness_damping_impedance(solref, solimp, impedance_pos, timestep)
     regulariser = jnp.maximum(invweight * (1 - d) / d, MIN_VALUE)
     return Rows(
@@ -103,7 +116,7 @@ class _Slip(NamedTuple):
 
 def _slip(u: jax.Array, cones: Cones) -> _Slip:
     normal, tangent = u[:, 0], u[:, 1:]
-    size = jnp.sqrt(jnp.sum(tangent * tangent, -1) + _SMALLEST_SLIP**2)
+    size = jnp.sqrt(_dot(tangent, tangent) + _SMALLEST_SLIP**2)
     slack = normal - cones.mu * size
     is_inside, is_polar = slack >= 0, cones.mu * normal + size <= 0
     ones = jnp.ones_like(normal)[:, None]
@@ -116,27 +129,37 @@ def _slip(u: jax.Array, cones: Cones) -> _Slip:
     )
 
 
+def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Sum over the last axis of a * b, written out: three or four terms need no kernel."""
+    first, *others = (a[..., i] * b[..., i] for i in range(a.shape[-1]))
+    return sum(others, start=first)
+
+
 def _cone_gradient(u: jax.Array, slip: _Slip) -> jax.Array:
     """Derivative of the contacts' cost by u, (contact, 4)."""
     return slip.sticks[:, None] * u + (slip.slides * slip.slack)[:, None] * slip.across
 
 
-def _cone_hessian(cones: Cones, slip: _Slip) -> jax.Array:
-    """Second derivative of the contacts' cost by the joint acceleration, (joint, joint)."""
-    contacts, _, joints = cones.jacobian.shape
+def _cone_derivatives(
+    u: jax.Array, cones: Cones, slip: _Slip
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Rows R (6 contact, joint), w and p (6 contact,): the contacts' cost has the derivatives R' p
+    and R' diag(w) R by the joint acceleration.
+    """
     # Where a contact slides, friction keeps its size and only turns: the slack's own curvature.
     turning = -slip.slides * slip.slack * slip.bend  # (contact,) >= 0
     along = slip.across[:, 1:] / cones.mu[:, None]  # unit vectors, (contact, 3)
-    tangent = cones.jacobian[:, 1:]
-    diagonal = jnp.concatenate(
-        [slip.sticks[:, None], jnp.repeat((slip.sticks + turning)[:, None], 3, 1)], 1
+    frame = [cones.jacobian[:, i] for i in range(4)]
+    slack_rows = sum(slip.across[:, i, None] * frame[i] for i in range(4))
+    along_rows = sum(along[:, i, None] * frame[1 + i] for i in range(3))
+    tangent = slip.sticks + turning
+    weight = [slip.sticks, tangent, tangent, tangent, slip.slides, -turning]
+    pull = [*(slip.sticks * u[:, i] for i in range(4)), slip.slides * slip.slack]
+    return (
+        jnp.concatenate([*frame, slack_rows, along_rows]),
+        jnp.concatenate(weight),
+        jnp.concatenate([*pull, jnp.zeros_like(turning)]),
     )
-    rows = cones.jacobian.reshape(-1, joints)
-    hessian = (rows.T * diagonal.reshape(-1)) @ rows
-    slack_rows = jnp.einsum("cf,cfj->cj", slip.across, cones.jacobian)
-    along_rows = jnp.einsum("cf,cfj->cj", along, tangent)
-    hessian += (slack_rows.T * slip.slides) @ slack_rows
-    return hessian - (along_rows.T * turning) @ along_rows
 
 
 def solve(
@@ -155,49 +178,65 @@ def solve(
     Minimises 1/2 (a - a0)' M (a - a0) + 1/2 sum_i D_i [J_i a - aref_i]^2 + contacts (NOTE 1) over
     the acceleration a; the first `equalities` rows always pay, the others where J_i a < aref_i.
     """
-    always = jnp.arange(rows.weight.shape[0]) < equalities
+    count, joints = rows.jacobian.shape
+    always = jnp.arange(count) < equalities
+    # All that is linear in the acceleration in one product: rows, contacts, the smooth part.
+    jacobian = jnp.concatenate([rows.jacobian, cones.jacobian.reshape(-1, joints)])
+    linear = jnp.concatenate([jacobian, mass])
+    offset = jnp.concatenate([rows.reference, cones.reference.reshape(-1), force])
 
-    def residuals(a):
-        return rows.jacobian @ a - rows.reference, cones.jacobian @ a - cones.reference
+    def parts(y):
+        return y[:count], y[count:-joints].reshape(-1, 4), y[-joints:]
 
     def active_weight(x):
         return rows.weight * (always | (x < 0))
 
+    def total(by_row, by_contact):
+        """Their sum; rows are dealt out to contacts first, so that it is a single reduction."""
+        contacts = len(by_contact)
+        dealt = jnp.pad(by_row, (0, -count % contacts)).reshape(-1, contacts)
+        return jnp.sum(sum(dealt, start=by_contact))
+
     def cost(a):
-        x, u = residuals(a)
+        x, u, smooth = parts(linear @ a - offset)
         slip = _slip(u, cones)
-        contacts = slip.sticks * jnp.sum(u * u, -1) + slip.slides * slip.slack**2
-        smooth = (mass @ a - force) @ (a - smooth_acceleration)
-        return 0.5 * (smooth + jnp.sum(active_weight(x) * x * x) + jnp.sum(contacts))
+        contacts = slip.sticks * _dot(u, u) + slip.slides * slip.slack**2
+        constraints = total(active_weight(x) * x * x, contacts)
+        return 0.5 * (smooth @ (a - smooth_acceleration) + constraints)
 
     def constraint_gradient(x, u, slip):
-        by_cones = jnp.einsum("cfj,cf->j", cones.jacobian, _cone_gradient(u, slip))
-        return rows.jacobian.T @ (active_weight(x) * x) + by_cones
+        by_row = jnp.concatenate([active_weight(x) * x, _cone_gradient(u, slip).reshape(-1)])
+        return jacobian.T @ by_row
 
     def newton(a, _):
-        x, u = residuals(a)
+        x, u, smooth = parts(linear @ a - offset)
         slip = _slip(u, cones)
-        gradient = mass @ a - force + constraint_gradient(x, u, slip)
-        hessian = mass + (rows.jacobian.T * active_weight(x)) @ rows.jacobian
-        hessian += _cone_hessian(cones, slip)
-        factor = jax.scipy.linalg.cho_factor(hessian)
-        search = -jax.scipy.linalg.cho_solve(factor, gradient)
-        slope = (mass @ a - force) @ search  # of the smooth part, at a
-        curvature = search @ mass @ search
-        x_change, u_change = rows.jacobian @ search, cones.jacobian @ search
+        cone_rows, cone_weight, cone_pull = _cone_derivatives(u, cones, slip)
+        own = active_weight(x)
+        all_rows = jnp.concatenate([rows.jacobian, cone_rows])
+        weight = jnp.concatenate([own, cone_weight])
+        pull = jnp.concatenate([own * x, cone_pull])
+        both = all_rows.T @ jnp.concatenate([weight[:, None] * all_rows, pull[:, None]], 1)
+        search = -solve_positive(mass + both[:, :-1], smooth + both[:, -1])
+        x_change, u_change, smooth_change = parts(linear @ search)
+        slope = smooth @ search  # of the smooth part, at a
+        curvature = smooth_change @ search
+        u_squared = u_change * u_change
+        tangent_squared = _dot(u_change[:, 1:], u_change[:, 1:])
 
         def derivatives(step):
             """First and second derivative of the cost at a + step * search."""
             x_at, u_at = x + step * x_change, u + step * u_change
             slip = _slip(u_at, cones)
             weight = active_weight(x_at) * x_change
-            first = jnp.sum(weight * x_at) + jnp.sum(_cone_gradient(u_at, slip) * u_change)
-            slack_change = jnp.sum(slip.across * u_change, -1)
-            tangent_change = jnp.sum(u_change[:, 1:] ** 2, -1)
+            slack_change = _dot(slip.across, u_change)
             along_change = (slack_change - u_change[:, 0]) / cones.mu
-            turned = slip.slack * slip.bend * (tangent_change - along_change**2)
-            second = jnp.sum(weight * x_change) + jnp.sum(
-                slip.sticks * jnp.sum(u_change**2, -1) + slip.slides * (slack_change**2 - turned)
+            turned = slip.slack * slip.bend * (tangent_squared - along_change**2)
+            first = total(weight * x_at, _dot(_cone_gradient(u_at, slip), u_change))
+            second = total(
+                weight * x_change,
+                slip.sticks * (u_squared[:, 0] + tangent_squared)
+                + slip.slides * (slack_change**2 - turned),
             )
             return slope + step * curvature + first, curvature + second
 
@@ -205,8 +244,42 @@ def solve(
 
     start = jnp.where(cost(warm_start) < cost(smooth_acceleration), warm_start, smooth_acceleration)
     a, _ = jax.lax.scan(newton, start, None, length=iterations)
-    x, u = residuals(a)
+    x, u, _ = parts(linear @ a - offset)
     return a, -constraint_gradient(x, u, _slip(u, cones))
+
+
+def solve_positive(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """Solution (n,) of a small symmetric positive definite system (n, n), by Cholesky factors."""
+    # On a GPU a library call for ten by ten matrices costs more than their arithmetic; on a CPU
+    # it costs as much, and compiles in less time.
+    return jax.lax.platform_dependent(matrix, vector, cpu=_by_library, default=_in_numbers)
+
+
+def _by_library(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), vector)
+
+
+def _in_numbers(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """The same written out number by number, which XLA makes two kernels of."""
+    n = len(vector)
+    factor: list[list[jax.Array]] = []
+    inverse: list[jax.Array] = []  # of the diagonal
+    half: list[jax.Array] = []  # L half = vector
+    for i in range(n):
+        row: list[jax.Array] = []
+        for j in range(i):
+            rest = sum((row[k] * factor[j][k] for k in range(j)), start=jnp.zeros(()))
+            row.append((matrix[i, j] - rest) * inverse[j])
+        pivot = matrix[i, i] - sum((x * x for x in row), start=jnp.zeros(()))
+        inverse.append(jax.lax.rsqrt(pivot))
+        rest = sum((row[k] * half[k] for k in range(i)), start=jnp.zeros(()))
+        half.append((vector[i] - rest) * inverse[i])
+        factor.append(row)
+    solution: list[jax.Array] = [jnp.zeros(())] * n
+    for i in reversed(range(n)):
+        rest = sum((factor[k][i] * solution[k] for k in range(i + 1, n)), start=jnp.zeros(()))
+        solution[i] = (half[i] - rest) * inverse[i]
+    return jnp.stack(solution)
 
 
 def line_search(derivatives, iterations: int) -> jax.Array:
@@ -227,5 +300,7 @@ def line_search(derivatives, iterations: int) -> jax.Array:
         return (jnp.where(inside, newton, bisect), low, high), None
 
     start = (jnp.ones(()), jnp.zeros(()), jnp.full((), jnp.inf))
-    (step, _, _), _ = jax.lax.scan(iterate, start, None, length=iterations)
+    search = lambda unroll: lambda: jax.lax.scan(iterate, start, None, iterations, unroll=unroll)
+    # A loop starts more kernels on a GPU, and compiles in less time where nothing is started.
+    (step, _, _), _ = jax.lax.platform_dependent(cpu=search(False), default=search(True))
     return step

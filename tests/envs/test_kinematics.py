@@ -1,0 +1,38 @@
+"""The arm's poses against MuJoCo's own, and what the chain must be like."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from envs.physics.mjx.kinematics import Kinematics
+from envs.physics.mjx.quiet import mjx
+from envs.physics.model import arm_model, load_scene
+
+POSES = ("xpos", "xquat", "xmat", "xanchor", "xaxis", "xipos", "ximat")
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return arm_model(load_scene("drawer"))
+
+
+def test_poses_are_mujocos(arm):
+    data, found = mujoco.MjData(arm), mjx.make_data(mjx.put_model(arm))
+    poses = jax.jit(lambda qpos: Kinematics(arm)(found.replace(qpos=qpos)))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        data.qpos[:] = rng.uniform(*arm.jnt_range.T)
+        mujoco.mj_kinematics(arm, data)
+        ours = poses(np.asarray(data.qpos, np.float32))
+        for name in POSES:
+            mine, theirs = np.asarray(getattr(ours, name)), getattr(data, name)
+            np.testing.assert_allclose(mine, theirs.reshape(mine.shape), atol=2e-6, err_msg=name)
+
+
+def test_another_kind_of_chain_is_refused():
+    joints = '<joint axis="1 0 0"/><joint axis="0 1 0"/>'
+    body = f'<body>{joints}<geom size="1"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    with pytest.raises(ValueError, match="one joint"):
+        Kinematics(model)
