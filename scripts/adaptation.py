@@ -208,7 +208,7 @@ def keep_goals(cells: Path, out: Path) -> None:
     cells.unlink()
 
 
-CURVES = ("cmrl", "cmrl-posterior", "pearl", "pearl-search", "untrained-search", "random-arm")
+CURVES = ("cmrl", "cmrl-posterior", "pearl", "pearl-sac", "untrained-search", "random-arm")
 GRADIENTS = ("finetune", "scratch")
 METHODS = {  # of (kind, adapt)
     ("cmrl", "search"): "cmrl",
