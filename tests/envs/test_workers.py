@@ -165,6 +165,7 @@ def started(rest: str) -> tuple[subprocess.Popen, list[int]]:
         [sys.executable, "-c", SCRIPT + rest],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"},
+        stdin=subprocess.PIPE,  # one that stays open: the tests' own may be at its end
         stdout=subprocess.PIPE,
         text=True,
     )

@@ -162,6 +162,81 @@ def _cone_derivatives(
     )
 
 
+class _Cost:
+    """The cost of one lane over the joint acceleration a, see `solve`."""
+
+    def __init__(self, mass, force, smooth_acceleration, rows, cones, equalities):
+        self.mass, self.smooth_acceleration = mass, smooth_acceleration
+        self.rows, self.cones = rows, cones
+        self.count, self.joints = rows.jacobian.shape
+        self.always = jnp.arange(self.count) < equalities
+        # All that is linear in a, in one product: rows, contacts, the smooth part.
+        self.jacobian = jnp.concatenate([rows.jacobian, cones.jacobian.reshape(-1, self.joints)])
+        self.linear = jnp.concatenate([self.jacobian, mass])
+        self.offset = jnp.concatenate([rows.reference, cones.reference.reshape(-1), force])
+
+    def parts(self, y):
+        """Of rows (row,), contacts (contact, 4) and joints (joint,) in a product with `linear`."""
+        return y[: self.count], y[self.count : -self.joints].reshape(-1, 4), y[-self.joints :]
+
+    def residuals(self, a):
+        return self.parts(self.linear @ a - self.offset)
+
+    def row_weight(self, x):
+        return self.rows.weight * (self.always | (x < 0))
+
+    def value(self, a):
+        x, u, smooth = self.residuals(a)
+        slip = _slip(u, self.cones)
+        contacts = slip.sticks * _dot(u, u) + slip.slides * slip.slack**2
+        constraints = _total(self.row_weight(x) * x * x, contacts)
+        return 0.5 * (smooth @ (a - self.smooth_acceleration) + constraints)
+
+    def constraint_force(self, a):
+        x, u, _ = self.residuals(a)
+        by_cone = _cone_gradient(u, _slip(u, self.cones))
+        return -jnp.concatenate([self.row_weight(x) * x, by_cone.reshape(-1)]) @ self.jacobian
+
+    def newton_step(self, x, u, smooth):
+        """The step that minimises the quadratic with the cost's derivatives at these residuals."""
+        weight = self.row_weight(x)
+        cone_rows, cone_weight, cone_pull = _cone_derivatives(u, self.cones, _slip(u, self.cones))
+        rows = jnp.concatenate([self.rows.jacobian, cone_rows])
+        weights = jnp.concatenate([weight, cone_weight])
+        pull = jnp.concatenate([weight * x, cone_pull])
+        # Hessian and gradient as one product.
+        both = rows.T @ jnp.concatenate([weights[:, None] * rows, pull[:, None]], 1)
+        return -solve_positive(self.mass + both[:, :-1], smooth + both[:, -1])
+
+    def along(self, x, u, smooth, direction):
+        """A function of a number: the cost's first two derivatives that far along a direction."""
+        x_change, u_change, smooth_change = self.parts(self.linear @ direction)
+        slope, curvature = smooth @ direction, smooth_change @ direction  # of the smooth part
+        tangent_squared = _dot(u_change[:, 1:], u_change[:, 1:])
+        u_squared = u_change[:, 0] ** 2 + tangent_squared
+
+        def derivatives(step):
+            x_at, u_at = x + step * x_change, u + step * u_change
+            slip = _slip(u_at, self.cones)
+            weight = self.row_weight(x_at) * x_change
+            slack_change = _dot(slip.across, u_change)
+            along_change = (slack_change - u_change[:, 0]) / self.cones.mu
+            turned = slip.slack * slip.bend * (tangent_squared - along_change**2)
+            first = _total(weight * x_at, _dot(_cone_gradient(u_at, slip), u_change))
+            bent = slip.sticks * u_squared + slip.slides * (slack_change**2 - turned)
+            second = _total(weight * x_change, bent)
+            return slope + step * curvature + first, curvature + second
+
+        return derivatives
+
+
+def _total(by_row: jax.Array, by_contact: jax.Array) -> jax.Array:
+    """The sum of both; rows are dealt out to contacts first, so that it is a single reduction."""
+    contacts = len(by_contact)
+    dealt = jnp.pad(by_row, (0, -len(by_row) % contacts)).reshape(-1, contacts)
+    return jnp.sum(sum(dealt, start=by_contact))
+
+
 def solve(
     mass: jax.Array,
     force: jax.Array,
@@ -178,74 +253,18 @@ def solve(
     Minimises 1/2 (a - a0)' M (a - a0) + 1/2 sum_i D_i [J_i a - aref_i]^2 + contacts (NOTE 1) over
     the acceleration a; the first `equalities` rows always pay, the others where J_i a < aref_i.
     """
-    count, joints = rows.jacobian.shape
-    always = jnp.arange(count) < equalities
-    # All that is linear in the acceleration in one product: rows, contacts, the smooth part.
-    jacobian = jnp.concatenate([rows.jacobian, cones.jacobian.reshape(-1, joints)])
-    linear = jnp.concatenate([jacobian, mass])
-    offset = jnp.concatenate([rows.reference, cones.reference.reshape(-1), force])
-
-    def parts(y):
-        return y[:count], y[count:-joints].reshape(-1, 4), y[-joints:]
-
-    def active_weight(x):
-        return rows.weight * (always | (x < 0))
-
-    def total(by_row, by_contact):
-        """Their sum; rows are dealt out to contacts first, so that it is a single reduction."""
-        contacts = len(by_contact)
-        dealt = jnp.pad(by_row, (0, -count % contacts)).reshape(-1, contacts)
-        return jnp.sum(sum(dealt, start=by_contact))
-
-    def cost(a):
-        x, u, smooth = parts(linear @ a - offset)
-        slip = _slip(u, cones)
-        contacts = slip.sticks * _dot(u, u) + slip.slides * slip.slack**2
-        constraints = total(active_weight(x) * x * x, contacts)
-        return 0.5 * (smooth @ (a - smooth_acceleration) + constraints)
-
-    def constraint_gradient(x, u, slip):
-        by_row = jnp.concatenate([active_weight(x) * x, _cone_gradient(u, slip).reshape(-1)])
-        return jacobian.T @ by_row
+    cost = _Cost(mass, force, smooth_acceleration, rows, cones, equalities)
 
     def newton(a, _):
-        x, u, smooth = parts(linear @ a - offset)
-        slip = _slip(u, cones)
-        cone_rows, cone_weight, cone_pull = _cone_derivatives(u, cones, slip)
-        own = active_weight(x)
-        all_rows = jnp.concatenate([rows.jacobian, cone_rows])
-        weight = jnp.concatenate([own, cone_weight])
-        pull = jnp.concatenate([own * x, cone_pull])
-        both = all_rows.T @ jnp.concatenate([weight[:, None] * all_rows, pull[:, None]], 1)
-        search = -solve_positive(mass + both[:, :-1], smooth + both[:, -1])
-        x_change, u_change, smooth_change = parts(linear @ search)
-        slope = smooth @ search  # of the smooth part, at a
-        curvature = smooth_change @ search
-        u_squared = u_change * u_change
-        tangent_squared = _dot(u_change[:, 1:], u_change[:, 1:])
+        residuals = cost.residuals(a)
+        direction = cost.newton_step(*residuals)
+        step = line_search(cost.along(*residuals, direction), line_search_iterations)
+        return a + step * direction, None
 
-        def derivatives(step):
-            """First and second derivative of the cost at a + step * search."""
-            x_at, u_at = x + step * x_change, u + step * u_change
-            slip = _slip(u_at, cones)
-            weight = active_weight(x_at) * x_change
-            slack_change = _dot(slip.across, u_change)
-            along_change = (slack_change - u_change[:, 0]) / cones.mu
-            turned = slip.slack * slip.bend * (tangent_squared - along_change**2)
-            first = total(weight * x_at, _dot(_cone_gradient(u_at, slip), u_change))
-            second = total(
-                weight * x_change,
-                slip.sticks * (u_squared[:, 0] + tangent_squared)
-                + slip.slides * (slack_change**2 - turned),
-            )
-            return slope + step * curvature + first, curvature + second
-
-        return a + line_search(derivatives, line_search_iterations) * search, None
-
-    start = jnp.where(cost(warm_start) < cost(smooth_acceleration), warm_start, smooth_acceleration)
+    is_warm_better = cost.value(warm_start) < cost.value(smooth_acceleration)
+    start = jnp.where(is_warm_better, warm_start, smooth_acceleration)
     a, _ = jax.lax.scan(newton, start, None, length=iterations)
-    x, u, _ = parts(linear @ a - offset)
-    return a, -constraint_gradient(x, u, _slip(u, cones))
+    return a, cost.constraint_force(a)
 
 
 def solve_positive(matrix: jax.Array, vector: jax.Array) -> jax.Array:
