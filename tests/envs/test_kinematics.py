@@ -1,10 +1,11 @@
-"""The arm's poses against MuJoCo's own, and what the chain must be like."""
+"""The arm against MuJoCo: poses, mass matrix and forces, and what the chain must be like."""
 
 import jax
 import mujoco
 import numpy as np
 import pytest
 
+from envs.physics.mjx.backend import MjxPhysics
 from envs.physics.mjx.kinematics import Kinematics
 from envs.physics.mjx.quiet import mjx
 from envs.physics.model import arm_model, load_scene
@@ -36,3 +37,26 @@ def test_another_kind_of_chain_is_refused():
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     with pytest.raises(ValueError, match="one joint"):
         Kinematics(model)
+
+
+def test_forces_and_mass_are_mujocos(arm):
+    """Bias, damping and the fingers' servos add up to all that acts on the arm."""
+    physics, data = MjxPhysics(), mujoco.MjData(arm)
+
+    @jax.jit
+    def ours(qpos, qvel, ctrl):
+        found = physics._data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl)
+        found = physics._smooth_dynamics(found)
+        return found.qfrc_smooth, mjx.full_m(physics.model, found)
+
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        data.qpos[:] = rng.uniform(*arm.jnt_range.T)
+        data.qvel[:] = rng.normal(size=arm.nv)
+        data.ctrl[:] = rng.uniform(-1, 1, arm.nu)
+        mujoco.mj_forward(arm, data)
+        force, mass = ours(*(np.float32(x) for x in (data.qpos, data.qvel, data.ctrl)))
+        np.testing.assert_allclose(force, data.qfrc_smooth, rtol=1e-5, atol=1e-4)
+        theirs = np.zeros((arm.nv, arm.nv))
+        mujoco.mj_fullM(arm, data, theirs)
+        np.testing.assert_allclose(mass, theirs, rtol=1e-5, atol=2e-6)
