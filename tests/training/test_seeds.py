@@ -5,10 +5,11 @@ Not to the last bit: a product of matrices for two seeds adds up in another orde
 
 import json
 import shutil
+import signal
 
 import numpy as np
 import pytest
-from run_helpers import native, rows_of, smoke, smoke_words, start
+from run_helpers import native, rows_of, run_and_signal, smoke, smoke_words, start
 
 import cmrl_jax as cj
 from cmrl_jax.cli.main import main
@@ -173,6 +174,17 @@ def test_mistakes_are_refused_in_one_line(together, left, tmp_path, refused):
     with pytest.raises(cj.ConfigError, match="shared by 2 seeds"):
         cj.train(cj.load_config("smoke.yaml"), tmp_path / "x", seeds=2, loggers=shared)  # type: ignore[call-overload]
     assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.slow
+def test_kill_9_leaves_a_group_that_goes_on_bit_for_bit(together, tmp_path):
+    run = tmp_path / "run"
+    marker = "seed 1: iter    1"
+    code, lines = run_and_signal(run, marker, *FLAGS, "--seeds", "2", signals=(signal.SIGKILL,))
+    assert code == -signal.SIGKILL and len(rows_of(run / "seed1")) < 3, lines
+    assert main(["--run", str(run), "--resume"]) == 0
+    for seed in ("seed0", "seed1"):
+        assert rows_of(run / seed) == rows_of(together / seed)
 
 
 @pytest.mark.slow
