@@ -82,17 +82,30 @@ class Lines:
 
 
 class Watch(cj.Logger):
-    """Notes when a run ends its first iteration, and when it has learned all its tasks."""
+    """Notes when a run ends its first iteration, and when it has learned all its tasks.
 
-    def __init__(self, tasks: tuple[str, ...], success: float, on_learned: Callable[[], None]):
-        self.tasks, self.success, self.on_learned = tasks, success, on_learned
+    Args:
+        on_first, on_learned: are called then, once each.
+    """
+
+    def __init__(
+        self,
+        tasks: tuple[str, ...],
+        success: float,
+        on_first: Callable[[], None],
+        on_learned: Callable[[], None],
+    ):
+        self.tasks, self.success = tasks, success
+        self.on_first, self.on_learned = on_first, on_learned
         self.first: float | None = None  # clock times
         self.learned: float | None = None
         self.env_steps = 0
 
     def row(self, row: Any, progress: Any) -> None:
         now = time.time()
-        self.first = self.first or now
+        if self.first is None:
+            self.first = now
+            self.on_first()
         if self.learned:
             return
         self.env_steps = row["env_steps"]
@@ -102,30 +115,33 @@ class Watch(cj.Logger):
             self.on_learned()
 
 
-def learn(name: str, config_file: str, size: Size, seeds: int, cache: str, began: float) -> None:
+def learn(name: str, config_file: str, size: Size, seeds: int, began: float) -> None:
     """Trains until all seeds have learned all tasks; seconds count from the command on."""
     config = cj.load_config(config_file, {**WATCHED, **dict(size.changes)})
     stop = cj.Stop()
     watches: list[Watch] = []
+    labels = {"config": config_file, "seeds": seeds}
+    add = lambda figure, value, unit: Lines().add(f"{name}/{figure}", value, unit, **labels)
 
-    def stop_when_all_have() -> None:
-        if all(watch.learned for watch in watches):
+    def on_first() -> None:
+        times = [watch.first for watch in watches if watch.first]
+        if len(times) == seeds:
+            add("first_iteration_s", max(times) - began, "s")
+
+    def on_learned() -> None:
+        times = [watch.learned for watch in watches if watch.learned]
+        if len(times) == seeds:
+            add("learned_s", max(times) - began, "s")
+            add("learned_env_steps", max(watch.env_steps for watch in watches), "1")
             stop.request()
 
-    def watch(one: cj.Config) -> list[cj.Logger]:
-        watches.append(Watch(one.tasks.train, size.success, stop_when_all_have))
+    def loggers(one: cj.Config) -> list[cj.Logger]:
+        watches.append(Watch(one.tasks.train, size.success, on_first, on_learned))
         return [watches[-1]]
 
     with tempfile.TemporaryDirectory() as folder:
-        cj.train(config, Path(folder) / "run", seeds=seeds, loggers=watch, stop=stop)
-    labels = {"config": config_file, "seeds": seeds, "cache": cache}
-    add = lambda figure, value, unit: Lines().add(f"{name}/{figure}", value, unit, **labels)
-    add("first_iteration_s", max(w.first for w in watches if w.first) - began, "s")
-    learned = [w.learned - began for w in watches if w.learned]
-    add("seeds_that_learned", len(learned), "1")
-    if len(learned) == seeds:
-        add("learned_s", max(learned), "s")
-        add("learned_env_steps", max(w.env_steps for w in watches), "1")
+        cj.train(config, Path(folder) / "run", seeds=seeds, loggers=loggers, stop=stop)
+    add("seeds_that_learned", sum(watch.learned is not None for watch in watches), "1")
 
 
 def device(size: Size, began: float) -> None:
@@ -161,13 +177,13 @@ def naive(size: Size, began: float) -> None:
 # Name -> what it does, and the seconds that it may take at most.
 PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
     "device": (device, 60),
-    "main": (lambda s, t: learn("main", s.main, s, 1, "empty", t), 300),
+    "main": (lambda s, t: learn("main", s.main, s, 1, t), 300),
     "mjx": (physics, 240),
-    "main-again": (lambda s, t: learn("main-again", s.main, s, 1, "filled", t), 200),
-    "main-seeds": (lambda s, t: learn("main-seeds", s.main, s, s.seeds, "empty", t), 300),
+    "main-again": (lambda s, t: learn("main-again", s.main, s, 1, t), 200),
+    "main-seeds": (lambda s, t: learn("main-seeds", s.main, s, s.seeds, t), 300),
     "learner": (lambda s, t: learner(s.main), 120),
     "native-workers": (workers, 120),
-    "large": (lambda s, t: learn("large", s.large, s, 1, "empty", t), 900),
+    "large": (lambda s, t: learn("large", s.large, s, 1, t), 900),
     "large-learner": (lambda s, t: learner(s.large), 300),
     "naive": (naive, 300),
 }

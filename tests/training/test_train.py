@@ -25,8 +25,6 @@ from cmrl_jax.jax_runtime import jit_once
 from cmrl_jax.storage.checkpoint import full_store
 from cmrl_jax.text import goal_files
 
-MJX = ("--model.net", "mlp")
-
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
@@ -42,7 +40,7 @@ def finished(tmp_path_factory):
             return original(self, *args, **kwargs)
 
         patch.setattr(jax.stages.Lowered, "compile", counted)
-        assert smoke(run, *MJX) == 0
+        assert smoke(run, "--model.net", "mlp") == 0
     return run, len(compiles)
 
 

@@ -51,7 +51,7 @@ def make_diagnose(config: Config, learner: Learner, goal_vectors: jax.Array) -> 
             text = goal_vectors[:, 0], jnp.ones(num_tasks)
             return jnp.mean(posterior(state.encoder_params, context, mask, *text).variance, -1)
 
-        # One pass for all sizes: four would take four times as long to compile.
+        # One pass for all sizes: there is less to compile than in four.
         by_size = jax.vmap(variance)(jnp.array(CONTEXT_SIZES))
         names = [f"posterior_variance_n{size}" for size in CONTEXT_SIZES]
         return dict(zip(names, by_size, strict=True))

@@ -1,8 +1,8 @@
 """The `mjx` backend: one control step of one lane, MJX for the arm and our own contacts around it.
 
-MJX computes the arm's mass matrix and bias forces. The fixture is one joint whose
-only coupling is contact, so it stays outside the MJX model as a few numbers per lane. Unused MJX
-stages (cameras, tendons, sensors, its collision driver) are skipped.
+MJX computes the arm's mass matrix and bias forces. The fixture is one joint whose only coupling is
+contact, so it stays outside the MJX model as a few numbers per lane. Unused MJX stages (cameras,
+tendons, sensors, its collision driver) are skipped.
 """
 
 from __future__ import annotations

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 
 from envs.engine import mujoco
 from envs.physics.mjx import rotations
-
-Numbers = Sequence[Any]  # the parts of a vector or a quaternion, (lane,) each or constants
+from envs.physics.mjx.rotations import Parts
 
 
 class Kinematics:
@@ -34,9 +33,9 @@ class Kinematics:
     def __call__(self, data: Any) -> Any:
         """MJX data with the poses of all bodies at its `qpos` (joint,)."""
         model, qpos = self._model, data.qpos
-        pos: list[Numbers] = [(0.0, 0.0, 0.0)]  # of the world
-        quat: list[Numbers] = [(1.0, 0.0, 0.0, 0.0)]
-        anchors: list[Numbers] = []
+        pos: list[Parts] = [(0.0, 0.0, 0.0)]  # of the world
+        quat: list[Parts] = [(1.0, 0.0, 0.0, 0.0)]
+        anchors: list[Parts] = []
         for body in range(1, model.nbody):
             parent, joint = model.body_parentid[body], body - 1
             axis = model.jnt_axis[joint].tolist()
@@ -61,38 +60,31 @@ class Kinematics:
             xquat=xquat,
             xmat=xmat,
             xanchor=_table(anchors),
-            xaxis=_rotated(xmat[1:], self._axis),
-            xipos=xpos + _rotated(xmat, self._com_pos),
+            xaxis=rotations.dot(xmat[1:], self._axis[:, None]),
+            xipos=xpos + rotations.dot(xmat, self._com_pos[:, None]),
             ximat=_matrix(com_quat),
         )
 
 
-def _table(rows: Sequence[Numbers]) -> jax.Array:
+def _table(rows: Sequence[Parts]) -> jax.Array:
     """Rows of numbers as an array (row, number)."""
     numbers = [jnp.asarray(x, jnp.float32) for row in rows for x in row]
     return jnp.stack(numbers).reshape(len(rows), -1)
 
 
-def _turned(q: Numbers, v: Numbers) -> Numbers:
+def _turned(q: Parts, v: Parts) -> Parts:
     """A vector turned by a unit quaternion."""
     w, *axis = q
     half = _cross(axis, v)
     return [x + 2 * (w * h + c) for x, h, c in zip(v, half, _cross(axis, half), strict=True)]
 
 
-def _cross(a: Numbers, b: Numbers) -> Numbers:
+def _cross(a: Parts, b: Parts) -> Parts:
     return [
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
         a[0] * b[1] - a[1] * b[0],
     ]
-
-
-def _rotated(matrices: jax.Array, vectors: jax.Array) -> jax.Array:
-    """(body, 3, 3) times (body, 3), written out: three terms need no kernel of their own."""
-    return sum(
-        (matrices[:, :, i] * vectors[:, i, None] for i in range(3)), start=jnp.zeros_like(vectors)
-    )
 
 
 def _matrix(q: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 Parts = Sequence[Any] | jax.Array
+"""The parts of a vector or a quaternion: numbers of one lane, arrays, or constants."""
 
 
 def product(u: Parts, v: Parts) -> list[Any]:
@@ -44,6 +45,12 @@ def multiply_vector(q: jax.Array, v: jax.Array) -> jax.Array:
 def conjugate(q: jax.Array) -> jax.Array:
     """The inverse rotation of a unit quaternion, (4,) -> (4,)."""
     return q * jnp.array([1.0, -1.0, -1.0, -1.0])
+
+
+def dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Sum over the last axis of a * b, written out: three or four terms need no kernel."""
+    first, *others = (a[..., i] * b[..., i] for i in range(a.shape[-1]))
+    return sum(others, start=first)
 
 
 def contact_frame(normal: jax.Array) -> jax.Array:

@@ -19,6 +19,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.physics.mjx import rotations
+
 MIN_VALUE = 1e-15  # mjMINVAL
 MIN_IMPEDANCE, MAX_IMPEDANCE = 1e-4, 0.9999  # mjMINIMP, mjMAXIMP
 _SMALLEST_SLIP = 1e-10  # keeps the direction of friction finite where nothing slips
@@ -116,7 +118,7 @@ class _Slip(NamedTuple):
 
 def _slip(u: jax.Array, cones: Cones) -> _Slip:
     normal, tangent = u[:, 0], u[:, 1:]
-    size = jnp.sqrt(_dot(tangent, tangent) + _SMALLEST_SLIP**2)
+    size = jnp.sqrt(rotations.dot(tangent, tangent) + _SMALLEST_SLIP**2)
     slack = normal - cones.mu * size
     is_inside, is_polar = slack >= 0, cones.mu * normal + size <= 0
     ones = jnp.ones_like(normal)[:, None]
@@ -127,12 +129,6 @@ def _slip(u: jax.Array, cones: Cones) -> _Slip:
         across=jnp.concatenate([ones, -cones.mu[:, None] * tangent / size[:, None]], 1),
         bend=cones.mu / size,
     )
-
-
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Sum over the last axis of a * b, written out: three or four terms need no kernel."""
-    first, *others = (a[..., i] * b[..., i] for i in range(a.shape[-1]))
-    return sum(others, start=first)
 
 
 def _cone_gradient(u: jax.Array, slip: _Slip) -> jax.Array:
@@ -188,7 +184,7 @@ class _Cost:
     def value(self, a):
         x, u, smooth = self.residuals(a)
         slip = _slip(u, self.cones)
-        contacts = slip.sticks * _dot(u, u) + slip.slides * slip.slack**2
+        contacts = slip.sticks * rotations.dot(u, u) + slip.slides * slip.slack**2
         constraints = _total(self.row_weight(x) * x * x, contacts)
         return 0.5 * (smooth @ (a - self.smooth_acceleration) + constraints)
 
@@ -212,17 +208,17 @@ class _Cost:
         """A function of a number: the cost's first two derivatives that far along a direction."""
         x_change, u_change, smooth_change = self.parts(self.linear @ direction)
         slope, curvature = smooth @ direction, smooth_change @ direction  # of the smooth part
-        tangent_squared = _dot(u_change[:, 1:], u_change[:, 1:])
+        tangent_squared = rotations.dot(u_change[:, 1:], u_change[:, 1:])
         u_squared = u_change[:, 0] ** 2 + tangent_squared
 
         def derivatives(step):
             x_at, u_at = x + step * x_change, u + step * u_change
             slip = _slip(u_at, self.cones)
             weight = self.row_weight(x_at) * x_change
-            slack_change = _dot(slip.across, u_change)
+            slack_change = rotations.dot(slip.across, u_change)
             along_change = (slack_change - u_change[:, 0]) / self.cones.mu
             turned = slip.slack * slip.bend * (tangent_squared - along_change**2)
-            first = _total(weight * x_at, _dot(_cone_gradient(u_at, slip), u_change))
+            first = _total(weight * x_at, rotations.dot(_cone_gradient(u_at, slip), u_change))
             bent = slip.sticks * u_squared + slip.slides * (slack_change**2 - turned)
             second = _total(weight * x_change, bent)
             return slope + step * curvature + first, curvature + second
