@@ -5,7 +5,7 @@ stopped (Ctrl-C, SIGTERM) and given again at any time. Runs go to runs/experimen
 results/ keeps of each (config, versions, thinned metrics, evaluation, inspection) is copied to
 results/NAME.
 `--list` prints the commands. All runs have one budget, BUDGET, but for the single-task ones, the
-multi-task ceiling and those that ask whether words matter.
+multi-task ceiling, those that ask whether words matter, and the large configuration on a CPU.
 """
 
 from __future__ import annotations
@@ -34,6 +34,12 @@ GROUNDED = f"--config ml4.yaml {BUDGET} --collect.scatter 0 --train.capacity 102
 GROUNDED += " --sac.policy_average 0"
 # Do words matter? Half the budget, and a KL weight at which z may carry something.
 WORDS = "--config ml4-plain.yaml --env.physics native --train.env_steps 600000 --kl.beta 0.001"
+# ml4-large.yaml with the widths, batch and lanes that two CPU cores carry; its critic, latent and
+# target rate are as they are.
+LARGE = "--config ml4-large.yaml --env.physics native --train.env_steps 600000"
+LARGE += " --model.modules 2,2,64 --model.trunk_width 128 --model.gating_width 64"
+LARGE += " --encoder.context_max 64 --sac.batch 128 --collect.lanes 96"
+LARGE += " --collect.updates_per_vector_step 4 --train.capacity 340000"
 
 EXPERIMENTS = {
     "cmrl-seed0": CMRL,
@@ -76,6 +82,7 @@ EXPERIMENTS = {
     "words-kl": WORDS,
     "words-recon": f"{WORDS} --encoder.aux recon",
     "words-canonical": f"{WORDS} --env.obs_mode canonical",
+    "large-on-cpu": LARGE,
 }
 
 
