@@ -40,7 +40,8 @@ parity: $(STAMP)
 # The newest versions: make lock ARGS=--upgrade. Names and versions only, the same for 3.12 and
 # 3.13 (checked by a dry run for each that uv finds); the cuda extra stays outside.
 lock: $(STAMP)
-	$(PY) -m uv pip compile pyproject.toml --extra dev --extra text --extra viz --python-version 3.12 \
+	$(PY) -m uv pip compile pyproject.toml --extra dev --extra text --extra viz --extra wandb \
+		--extra docs --extra notebook --python-version 3.12 \
 		--python-platform linux --strip-extras --no-header --no-annotate --no-emit-index-url \
 		--output-file requirements.lock --quiet $(ARGS)
 	for version in 3.12 3.13; do \
