@@ -17,7 +17,7 @@ from envs.goal_names import GOALS, LARGEST_SEED
 from envs.outputs import FORCE_HELP
 
 # `train` is what is meant where none is named.
-COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "bench", "render", "goals")
+COMMANDS = ("train", "eval", "sweep", "finetune", "plot", "report", "bench", "render", "goals")
 
 
 def parser_of(command: str, description: str) -> Parser:

@@ -16,7 +16,14 @@ from pathlib import Path
 from typing import Any
 
 from cmrl_jax import streams
-from cmrl_jax.cli import evaluate_flags, finetune_flags, plot_flags, render_flags, train
+from cmrl_jax.cli import (
+    evaluate_flags,
+    finetune_flags,
+    plot_flags,
+    render_flags,
+    report_flags,
+    train,
+)
 from cmrl_jax.cli.flags import COMMANDS, add_force, names, parse, parser_of
 from cmrl_jax.config.files import (
     run_config,
@@ -96,6 +103,7 @@ def _dispatch(words: list[str]) -> int:
         "plot": _plot,
         "bench": _bench,
         "render": _render,
+        "report": _report,
         "goals": _goals,
     }
     return run[command](words)
@@ -121,6 +129,18 @@ def _plot(words: list[str]) -> int:
             print(inspection.inspect_run(run) or f"{run} has neither z nor modules to inspect")
     for picture in plots.plot_inspections(args.run, out):
         print(picture)
+    return 0
+
+
+def _report(words: list[str]) -> int:
+    args = parse(report_flags.add_flags(parser_of("report", report_flags.DESCRIPTION)), words)
+    plot_flags.check_runs(args.run)
+    out = args.out or args.run[0] / "report.html"
+    writable(out, "--out", written_by("report"), args.force)
+
+    from cmrl_jax.analysis import report
+
+    print(report.write_report(args.run, args.json, out))
     return 0
 
 

@@ -10,9 +10,10 @@ import pytest
 from run_file_helpers import CSV, evaluation, write_run
 
 from cmrl_jax.analysis import plots
-from cmrl_jax.analysis.plots import Runs, band, read_metrics, series
+from cmrl_jax.analysis.run_set import Runs, band, series
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.storage.run_files import read_metrics
 from envs.tasks import METAWORLD_TASKS as TASKS
 
 ROOT = Path(__file__).parents[2]
