@@ -48,7 +48,7 @@ K = (0, 1, 2, 5, 10, 20)
 KINDS = {
     "cmrl": "--config ml4.yaml",
     "pearl": "--config pearl.yaml --env.obs_mode canonical --collect.scatter 40"
-    " --train.capacity 340000 --train.env_steps 600000 --sac.policy_average 0.1",
+    " --train.capacity 340000 --sac.policy_average 0.1",
     # PEARL's belief over transitions on the main job's own actor-critic: no text, no modules.
     "pearlsac": "--config ml4.yaml --model.net mlp --model.mlp_hidden 128,128,128"
     " --encoder.goal_fusion none --encoder.p_empty 0.0 --encoder.aux none"

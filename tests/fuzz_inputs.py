@@ -157,6 +157,7 @@ USUAL = {
     "sweep": {"--runs": ["r", "r*", "runs/*"]},
     "finetune": {"--run": ["r"], "--task": ["window-close"], "--episodes": ["3"]},
     "plot": {"--run": ["r", "flat"]},
+    "report": {"--run": ["r", "flat"]},
     "bench": {},
     "render": {"--run": ["r", "flat"]},
     "goals": {},

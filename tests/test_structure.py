@@ -59,7 +59,7 @@ LIGHT = {
     "text.goal_files",
     *(f"evaluation.{name}" for name in ("options", "finetune_options", "cells")),
     *(f"cli.{name}" for name in ("main", "train", "stop_signal", "flags", "goals")),
-    *(f"cli.{name}_flags" for name in ("evaluate", "render", "finetune", "plot")),
+    *(f"cli.{name}_flags" for name in ("evaluate", "render", "finetune", "plot", "report")),
 }
 LIGHT_OF_ENVS = {"command_line", "goal_names", "outputs", "tasks"}  # what those take from envs
 # Light ones whose commands import the programs they run.

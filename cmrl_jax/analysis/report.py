@@ -58,7 +58,8 @@ def write_report(runs: Sequence[Path], files: Sequence[Path], out: Path) -> Path
         ConfigError: plotly is missing, a file is missing or damaged, or `out` cannot be written.
     """
     go, script = _plotly()
-    page = "".join(_page(go, Runs(runs), runs, _read(files)))
+    found = _read(files)  # first: a file that was mistyped is the user's likeliest mistake
+    page = "".join(_page(go, Runs(runs), runs, found))
     template = Template((DATA / "report.html").read_text(encoding="utf-8"))
     title = html.escape(", ".join(shown_names(runs)))
     text = template.substitute(mark=written_by("report"), title=title, plotly=script, body=page)

@@ -127,6 +127,7 @@ def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, re
     console = consoles[0]
     if outcome.is_finished:
         console.message(f"done in {format_duration(outcome.wall_s)}: {place}")
+        _report([run for _, run in runs], place, console)
         return 0
     text = f"stopped after iteration {outcome.iteration}; "
     text += f"go on with: {command('--run', place, '--resume')}"
@@ -137,6 +138,18 @@ def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, re
     to_stderr(text)
     is_left = error.errno in READER_LEFT
     return 0 if is_left else exit_code(error)
+
+
+def _report(runs: Sequence[Path], place: Path, console: Any) -> None:
+    """Writes a page of what was trained, where plotly is there; a run is done without it too."""
+    if importlib.util.find_spec("plotly") is None:
+        return
+    from cmrl_jax.analysis.report import write_report
+
+    try:
+        console.message(f"report: {write_report(runs, [], place / 'report.html')}")
+    except ConfigError as error:
+        console.message(f"no report: {error.cause} ({error.cure})")
 
 
 def _check_extras(config: Config) -> None:

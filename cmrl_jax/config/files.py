@@ -52,7 +52,6 @@ FORMER_DEFAULTS = {
     "kl.beta": 0.1,
     "sac.policy_average": 0.0,
     "collect.scatter": 0,
-    "train.env_steps": 1_000_000,
     "train.capacity": 102_400,
 }
 """Defaults that are others today, of runs from before a key was added."""

@@ -225,7 +225,7 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    env_steps: int = doc(600_000, "control steps of all lanes together; 0: no limit", high=10**12)
+    env_steps: int = doc(1_000_000, "control steps of all lanes together; 0: no limit", high=10**12)
     minutes: float = doc(0.0, "wall-time limit of the whole run, final evaluation apart; 0: none")
     capacity: int = doc(
         340_000,

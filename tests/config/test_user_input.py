@@ -12,7 +12,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from cmrl_jax.cli import evaluate_flags, finetune_flags, plot_flags, render_flags, train
+from cmrl_jax.cli import (
+    evaluate_flags,
+    finetune_flags,
+    plot_flags,
+    render_flags,
+    report_flags,
+    train,
+)
 from cmrl_jax.cli import goals as goals_cli
 from cmrl_jax.cli import main as cli
 from cmrl_jax.cli.main import main
@@ -32,12 +39,14 @@ PARSERS = {
     "render": render_flags.add_flags(Parser()),
     "finetune": finetune_flags.add_flags(Parser()),
     "plot": plot_flags.add_flags(Parser()),
+    "report": report_flags.add_flags(Parser()),
     "parity": parity._parser(),
 }
 goals_cli.add_flags(goals := Parser())
 PARSERS["goals"] = goals
 ALONE = {"parity": parity.main, "picture": picture.main, "goal_sets": goal_sets.main}
-RUN = {"eval": "--run", "sweep": "--runs", "finetune": "--run", "plot": "--run", "render": "--run"}
+RUN = {"sweep": "--runs"}
+RUN |= {command: "--run" for command in ("eval", "finetune", "plot", "render", "report")}
 
 
 def flags_of(kind: type) -> list[tuple[str, str]]:
