@@ -27,7 +27,9 @@ from cmrl_jax.registry import register_environment as register_environment
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.run_dir import all_begun, find_run, runs_at
 from cmrl_jax.training import trainer
-from cmrl_jax.training.loggers import Console, Logger, loggers_of
+from cmrl_jax.training.console import Console
+from cmrl_jax.training.logger import Logger
+from cmrl_jax.training.loggers import loggers_of
 from cmrl_jax.training.metrics import read_rows
 from envs.base import MetaEnv as MetaEnv
 
@@ -121,9 +123,9 @@ def train(
         seeds: runs with that many seeds, from `config.seed` on, are trained in one program and
             returned as a list; their directories are `run_dir`/seed0, `run_dir`/seed1 and so on.
             Each leaves what it would leave alone, equal to within rounding.
-        loggers: take rows and messages; by default lines on standard output, and TensorBoard
-            where `log.tensorboard` asks for it. An empty list is silent. With `seeds`, a function
-            from a run's configuration to its loggers.
+        loggers: take rows and messages; by default lines on standard output, and what `log` asks
+            for (TensorBoard, Weights & Biases, films). An empty list is silent. With `seeds`, a
+            function from a run's configuration to its loggers.
         stop: `stop.request()`, from any thread, ends the run at the next border of an iteration.
 
     Raises:

@@ -1,6 +1,7 @@
 """Shared by the tests of whole runs: starting one, and reading back all that it left."""
 
 import csv
+import json
 import os
 import signal
 import subprocess
@@ -107,6 +108,41 @@ def tensorboard_points(directory):
             points += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
             data = data[16 + length :]
     return sorted(points)
+
+
+def wandb_points(directory):
+    """(env step, tag, figure) of the points that W&B's offline runs in a directory hold.
+
+    Films, which are files to W&B, are left out.
+    """
+    from wandb.proto import wandb_internal_pb2
+
+    proto: Any = wandb_internal_pb2
+    points = {}
+    for path in sorted(directory.glob("offline-run-*/*.wandb")):
+        for data in leveldb_records(path.read_bytes()):
+            record = proto.Record.FromString(data)
+            if record.WhichOneof("record_type") == "history":
+                items = {i.key or "/".join(i.nested_key): i.value_json for i in record.history.item}
+                step = int(items.pop("_step"))
+                shown = {k: v for k, v in items.items() if not k.startswith(("_", "film/"))}
+                points |= {(step, name): json.loads(value) for name, value in shown.items()}
+    return sorted((step, name, float(np.float32(v))) for (step, name), v in points.items())
+
+
+def leveldb_records(data):
+    """The records of a file in LevelDB's log format, after W&B's 7 bytes of their own."""
+    block, at, parts = 32768, 7, []
+    while at + 7 <= len(data):
+        if block - at % block < 7:  # a header does not straddle blocks
+            at += block - at % block
+            continue
+        length, kind = int.from_bytes(data[at + 4 : at + 6], "little"), data[at + 6]
+        parts.append(data[at + 7 : at + 7 + length])
+        at += 7 + length
+        if kind in (1, 4):  # whole, or the last part
+            yield b"".join(parts)
+            parts = []
 
 
 def csv_points(path):

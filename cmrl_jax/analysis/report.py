@@ -20,8 +20,9 @@ from cmrl_jax.analysis.inspection_figures import verdict
 from cmrl_jax.analysis.inspection_file import Inspection, read_inspection
 from cmrl_jax.analysis.run_set import Runs
 from cmrl_jax.commands import quoted, shown
+from cmrl_jax.config.extras import require_extra
 from cmrl_jax.config.presets import preset_of
-from cmrl_jax.config.schema import ConfigError, call_envs
+from cmrl_jax.config.schema import call_envs
 from cmrl_jax.evaluation.statistics import interquartile_mean, wilson_interval
 from cmrl_jax.formats import format_duration
 from cmrl_jax.places import DATA
@@ -36,7 +37,6 @@ from cmrl_jax.storage.run_files import (
 from cmrl_jax.storage.run_groups import shown_names
 from envs.outputs import replacing, written_by
 
-CURE = "pip install 'cmrl-jax[viz]'"
 VERSIONS = "versions.json"
 
 
@@ -74,13 +74,10 @@ def write_report(runs: Sequence[Path], files: Sequence[Path], out: Path) -> Path
 
 def _plotly() -> tuple[Any, str]:
     """plotly's figures, and its JavaScript."""
-    try:
-        import plotly.graph_objects as go
-        from plotly.offline import get_plotlyjs
-    except ImportError as error:
-        raise ConfigError(
-            "report needs the package plotly, which is not installed", CURE
-        ) from error
+    require_extra("report")
+    import plotly.graph_objects as go
+    from plotly.offline import get_plotlyjs
+
     return go, get_plotlyjs()
 
 

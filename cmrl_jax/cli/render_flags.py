@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
 from cmrl_jax.analysis.film_options import FilmOptions
 from cmrl_jax.cli.flags import add_force, episodes, goal_index, names, natural, seed, steps
+from cmrl_jax.config.extras import require_extra
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.schema import ConfigError, call_envs, require
+from cmrl_jax.config.schema import call_envs, require
 from cmrl_jax.evaluation.options import (
     ADAPT,
     SEARCH_K,
@@ -29,7 +29,6 @@ DESCRIPTION = (
     "Films one adaptation run per task in Meta-World's own scene: k exploration episodes, then the "
     "reported one, as an mp4 and a contact sheet (PNG). Physics: MuJoCo C."
 )
-_PACKAGES = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
 
 
 def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -75,10 +74,7 @@ def options_of(args: argparse.Namespace) -> tuple[Path, FilmOptions, Path]:
     cause = f"render with env.name {config.env.name}"
     require(config.env.name == "ml4", cause, "give a run of ml4: films show Meta-World's scenes")
     check_run(replace(asked, k=asked.k or (0,)), run)
-    for module, package in _PACKAGES.items():
-        if importlib.util.find_spec(module) is None:
-            cause = f"render needs the package {package}, which is not installed"
-            raise ConfigError(cause, "pip install 'cmrl-jax[viz]'")
+    require_extra("render")
     out = args.out or run / "render"
     call_envs(lambda: make_directory(out, "--out"))
     for task in evaluated_tasks(asked, config):

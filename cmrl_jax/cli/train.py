@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import typing
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, Literal
 from cmrl_jax.cli.flags import COMMANDS, Parser, parse
 from cmrl_jax.cli.stop_signal import StopSignal
 from cmrl_jax.commands import command, program, shown
+from cmrl_jax.config.extras import is_installed, require_extras_of
 from cmrl_jax.config.files import (
     config_dirs,
     field_types,
@@ -106,7 +106,8 @@ def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, re
     """
     from cmrl_jax.formats import format_duration
     from cmrl_jax.training import trainer
-    from cmrl_jax.training.loggers import Console, loggers_of
+    from cmrl_jax.training.console import Console
+    from cmrl_jax.training.loggers import loggers_of
 
     # Who cannot be told what happens has left: the run saves and ends.
     consoles = [
@@ -142,7 +143,7 @@ def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, re
 
 def _report(runs: Sequence[Path], place: Path, console: Any) -> None:
     """Writes a page of what was trained, where plotly is there; a run is done without it too."""
-    if importlib.util.find_spec("plotly") is None:
+    if not is_installed("report"):
         return
     from cmrl_jax.analysis.report import write_report
 
@@ -154,6 +155,4 @@ def _report(runs: Sequence[Path], place: Path, console: Any) -> None:
 
 def _check_extras(config: Config) -> None:
     find_table(config.goals.table)
-    if config.log.tensorboard and importlib.util.find_spec("tensorboardX") is None:
-        cause = "log.tensorboard needs the package tensorboardX, which is not installed"
-        raise ConfigError(cause, "pip install 'cmrl-jax[viz]', or set log.tensorboard: false")
+    require_extras_of(config)

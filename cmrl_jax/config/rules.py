@@ -34,6 +34,9 @@ def validate(config: Config) -> None:
     lanes, trained = config.collect.lanes, len(config.tasks.train)
     cause = f"collect.lanes {lanes} is not divisible by the {trained} training tasks"
     require(lanes % trained == 0, cause, f"set collect.lanes: {-(-lanes // trained) * trained}")
+    films, name = config.log.video_every, config.env.name
+    cause = f"log.video_every {films} with env.name {name}"
+    require(not films or name == "ml4", cause, "set it to 0: films show Meta-World's scenes")
     call_envs(lambda: rules_of(config)).check()
 
 

@@ -265,6 +265,8 @@ class CheckpointConfig:
 @dataclass(frozen=True)
 class LogConfig:
     tensorboard: bool = doc(False, "write TensorBoard events too")
+    wandb: bool = doc(False, "log to Weights & Biases too; WANDB_MODE=offline needs no account")
+    video_every: int = doc(0, "film the policy every so many iterations, in a process; 0: never")
     progress: bool = doc(True, "progress bar when the output is a terminal")
 
 

@@ -17,7 +17,7 @@ from cmrl_jax.registry import rules_of
 from cmrl_jax.storage.checkpoint import join_run, split_run
 from cmrl_jax.storage.versions import package_versions, write_versions
 from cmrl_jax.text.goals import check_same_table
-from cmrl_jax.training.loggers import Logger, Progress, RunInfo
+from cmrl_jax.training.logger import Logger, Progress, RunInfo
 from cmrl_jax.training.metrics import MetricsCsv
 
 
@@ -112,8 +112,7 @@ class Run:
         write_versions(self.run_dir / "versions.json")
         for logger in self.loggers:
             begun = time.time() - wall
-            tasks = self.config.tasks.train
-            logger.start(RunInfo(self.run_dir, tasks, self.csv.rows(), begun))
+            logger.start(RunInfo(self.run_dir, self.config, self.csv.rows(), begun))
 
     def write(self, row: dict[str, Any], progress: Progress) -> None:
         assert self.csv is not None  # started

@@ -28,7 +28,7 @@ from cmrl_jax.registry import rules_of
 from cmrl_jax.stop import Stop
 from cmrl_jax.storage.checkpoint import full_store, policy_store
 from cmrl_jax.storage.run_dir import write_text
-from cmrl_jax.training.loggers import Logger, Progress
+from cmrl_jax.training.logger import Logger, Progress
 from cmrl_jax.training.metrics import LEADING_COLUMNS, metric_names, metric_row
 from cmrl_jax.training.run import Run, steps_of
 
@@ -308,7 +308,8 @@ class _Training:
 
     def is_policy_due(self) -> bool:
         """Whether this border has a policy checkpoint, however long the iterations took."""
-        return self.done > 0 and self.done % self.config.checkpoint.policy_every == 0
+        intervals = self.config.checkpoint.policy_every, self.config.log.video_every
+        return self.done > 0 and any(n and self.done % n == 0 for n in intervals)
 
     def evaluate(self) -> list[dict[str, Any]]:
         """Columns of a periodic evaluation of every run: few goals, few k, all tasks."""

@@ -14,10 +14,11 @@ import pytest
 from run_helpers import csv_points, tensorboard_points
 
 from cmrl_jax import formats
-from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.storage import versions
-from cmrl_jax.training import loggers, metrics
-from cmrl_jax.training.loggers import Progress, RunInfo
+from cmrl_jax.training import console, metrics
+from cmrl_jax.training.logger import Progress, RunInfo
+from cmrl_jax.training.tensorboard import TensorBoard
 
 COLUMNS = (*metrics.LEADING_COLUMNS, "train/critic_loss", "eval/drawer-open/k0/success_any")
 
@@ -127,8 +128,8 @@ def test_columns_and_rows_are_checked(tmp_path):
 
 def test_tensorboard_events_hold_the_figures(tmp_path):
     pytest.importorskip("tensorboardX")
-    sink = loggers.TensorBoard()
-    sink.start(RunInfo(tmp_path, ()))
+    sink = TensorBoard()
+    sink.start(RunInfo(tmp_path, Config()))
     row = make_row(3, **{"train/critic_loss": jnp.float32(0.25), "train/absent": None})
     sink.row(row, Progress(0.5, 1.0))
     sink.close()
@@ -138,8 +139,10 @@ def test_tensorboard_events_hold_the_figures(tmp_path):
 def test_a_killed_process_leaves_every_row_in_tensorboard(tmp_path):
     pytest.importorskip("tensorboardX")
     script = "import os, sys; from pathlib import Path\n"
-    script += "from cmrl_jax.training.loggers import Progress, RunInfo, TensorBoard\n"
-    script += "sink = TensorBoard(); sink.start(RunInfo(Path(sys.argv[1]), ()))\n"
+    script += "from cmrl_jax.config.schema import Config\n"
+    script += "from cmrl_jax.training.logger import Progress, RunInfo\n"
+    script += "from cmrl_jax.training.tensorboard import TensorBoard\n"
+    script += "sink = TensorBoard(); sink.start(RunInfo(Path(sys.argv[1]), Config()))\n"
     script += "row = {'env_steps': 10, 'wall_s': 0.5} | {f'train/{i}': i for i in range(40)}\n"
     script += "sink.row(row, Progress(0.5, 1.0)); os._exit(0)"
     subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=True)
@@ -156,8 +159,8 @@ def test_a_resumed_file_and_tensorboard_have_every_row_once(tmp_path):
     def process(iterations, offset=None):
         """Writes rows as one process does; returns the length of the CSV after each."""
         csv = metrics.MetricsCsv(path, COLUMNS, offset)
-        board = loggers.TensorBoard()
-        board.start(RunInfo(tmp_path, (), csv.rows()))
+        board = TensorBoard()
+        board.start(RunInfo(tmp_path, Config(), csv.rows()))
         offsets = []
         for iteration in iterations:
             row = make_row(iteration, **{figure: 0.1 * iteration})
@@ -177,7 +180,7 @@ def test_a_resumed_file_and_tensorboard_have_every_row_once(tmp_path):
 def test_missing_tensorboard_names_its_cure(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(ConfigError) as raised:
-        loggers.TensorBoard()
+        TensorBoard()
     assert "tensorboardX" in raised.value.cause and "pip install" in raised.value.cure
 
 
@@ -203,12 +206,12 @@ def test_the_console_line_shows_each_figure_once():
         "train/routing_entropy": 0.98,
         "time/env_steps_per_s": 4123.4,
     }
-    assert loggers.format_iteration(row, tasks, 187.0) == (
+    assert console.format_iteration(row, tasks, 187.0) == (
         "iter   12     460,800 steps | success drawer-open 0.25 drawer-close 1.00 | "
         "return drawer-open 512 drawer-close 1830 | critic 0.0123  KL 3.50 nats  routing 0.98 | "
         "4,123 steps/s | ETA 3m07s"
     )
-    assert loggers.format_iteration(make_row(0), tasks, math.inf) == (
+    assert console.format_iteration(make_row(0), tasks, math.inf) == (
         "iter    0           0 steps | ETA ?"
     )
 
@@ -222,8 +225,8 @@ def test_the_evaluation_line_groups_by_task():
         "eval/window-open/k2/success_any": None,
     }
     expected = "evaluation | drawer-open k0 0.50 k2 0.75 | window-close k2 0.00"
-    assert loggers.format_evaluation(row) == expected
-    assert loggers.format_evaluation(make_row(1)) is None
+    assert console.format_evaluation(row) == expected
+    assert console.format_evaluation(make_row(1)) is None
 
 
 class Terminal(io.StringIO):
@@ -233,9 +236,9 @@ class Terminal(io.StringIO):
 
 def test_a_progress_bar_is_drawn_on_a_terminal_only():
     def show(stream: io.StringIO, progress: bool) -> str:
-        console = loggers.Console(progress, stream)
-        console.message("a line [with] brackets")
-        console.close()
+        lines = console.Console(progress, stream)
+        lines.message("a line [with] brackets")
+        lines.close()
         return stream.getvalue()
 
     assert show(io.StringIO(), True) == "a line [with] brackets\n"

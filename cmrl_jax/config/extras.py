@@ -1,0 +1,44 @@
+"""Packages that only some commands and options need: whether they are installed, and what to do."""
+
+from __future__ import annotations
+
+import importlib.util
+
+from cmrl_jax.config.schema import Config, ConfigError
+
+# What needs them -> the extra of pyproject.toml, and module -> package.
+NEEDS = {
+    "log.tensorboard": ("viz", {"tensorboardX": "tensorboardX"}),
+    "log.wandb": ("wandb", {"wandb": "wandb"}),
+    "log.video_every": ("viz", {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}),
+    "render": ("viz", {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}),
+    "report": ("viz", {"plotly": "plotly"}),
+}
+
+
+def is_installed(needed_by: str) -> bool:
+    """Whether all packages are there that something in `NEEDS` needs."""
+    return not _missing(needed_by)
+
+
+def require_extra(needed_by: str) -> None:
+    """Raises ConfigError where a package is missing that something in `NEEDS` needs."""
+    if missing := _missing(needed_by):
+        extra, _ = NEEDS[needed_by]
+        cure = f"pip install 'cmrl-jax[{extra}]'"
+        if needed_by.startswith("log."):
+            cure += f", or leave {needed_by} out"
+        cause = f"{needed_by} needs the package {missing[0]}, which is not installed"
+        raise ConfigError(cause, cure)
+
+
+def require_extras_of(config: Config) -> None:
+    """Raises ConfigError where a package is missing that `log` asks for."""
+    for name in ("tensorboard", "wandb", "video_every"):
+        if getattr(config.log, name):
+            require_extra(f"log.{name}")
+
+
+def _missing(needed_by: str) -> list[str]:
+    _, modules = NEEDS[needed_by]
+    return [package for name, package in modules.items() if importlib.util.find_spec(name) is None]
