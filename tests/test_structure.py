@@ -54,6 +54,7 @@ LIGHT = {
     "algorithms.cmrl.rules",
     *(f"config.{name}" for name in ("schema", "rules", "files", "yaml_tree", "extras")),
     *(f"storage.{name}" for name in ("run_dir", "documents", "run_files", "run_groups", "locks")),
+    "storage.kept_policies",
     "storage.output_files",
     "analysis.film_options",
     "text.goal_files",

@@ -34,8 +34,9 @@ from cmrl_jax.evaluation.options import (
     check_options,
     check_run,
 )
+from cmrl_jax.storage.kept_policies import kept_policies
 from cmrl_jax.storage.output_files import distinct, writable
-from cmrl_jax.storage.run_dir import holds_run
+from cmrl_jax.storage.run_dir import find_run, holds_run
 from envs.command_line import brief, typed_path, whole
 from envs.goal_names import GOALS
 from envs.outputs import written_by
@@ -203,6 +204,7 @@ def find_runs(patterns: Sequence[str]) -> list[Path]:
     found: dict[Path, Path] = {}
     for pattern in patterns:
         runs = [Path(p) for p in sorted(glob.glob(pattern)) if holds_run(Path(p))]
+        runs = runs or list(kept_policies(pattern).values())
         if not runs:
             cure = "give directories that hold a run, as --runs 'runs/ml4-*'"
             raise ConfigError(f"--runs {brief(pattern)} matches no run", cure)
@@ -242,13 +244,14 @@ def run_eval(words: Sequence[str]) -> int:
     """The command `eval`; returns the exit code."""
     args = parse(eval_parser(), words)
     options = options_of(args)
-    check_run(options, args.run)
+    run = find_run(args.run)
+    check_run(options, run)
     _check_outputs(args, "eval")
 
     from cmrl_jax.cli import evaluate as evaluate_cli
 
     return evaluate_cli.evaluate_run(
-        run=args.run,
+        run=run,
         options=options,
         checkpoint=args.checkpoint,
         json_path=args.json,

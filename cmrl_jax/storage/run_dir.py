@@ -20,8 +20,9 @@ from cmrl_jax.commands import command, quoted
 from cmrl_jax.config.files import check_resumable, read_yaml, to_yaml
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config, ConfigError, call_envs, require
+from cmrl_jax.storage.kept_policies import kept_policies
 from cmrl_jax.storage.locks import lock
-from envs.command_line import brief, what_is
+from envs.command_line import brief, suggest, what_is
 
 RUN_FILES = ("config.yaml", "metrics.csv", "ckpt")
 ROOT = Path("runs")
@@ -64,7 +65,7 @@ def _age(path: Path) -> tuple[str, int]:
 
 
 def find_run(path: Path) -> Path:
-    """`path`, if it holds a run.
+    """`path`, if it holds a run, or the policy of that name that comes with the project.
 
     Raises:
         ConfigError: naming the runs that are there, or why nothing can be said of `path`.
@@ -72,6 +73,8 @@ def find_run(path: Path) -> Path:
     call_envs(lambda: what_is(path / RUN_FILES[0]))
     if holds_run(path):
         return path
+    if (kept := kept_policies()).keys() & {str(path)}:
+        return kept[str(path)]
     if group := seed_dirs(path):
         names = ", ".join(quoted(run) for run in group.values())
         raise ConfigError(f"{brief(path)} holds {len(group)} seeds", f"give --run one of: {names}")
@@ -79,7 +82,7 @@ def find_run(path: Path) -> Path:
     state = "holds no run" if path.is_dir() else "does not exist"
     train = f"train first: {command('--config', 'ml4.yaml')}"
     cure = f"give --run one of: {', '.join(known)}" if known else train
-    raise ConfigError(f"run directory {brief(path)} {state}", cure)
+    raise ConfigError(f"run directory {brief(path)} {state}", suggest(str(path), kept) + cure)
 
 
 def resumed_run(stem: str, run: Path | None) -> Path:
