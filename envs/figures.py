@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 
@@ -17,7 +18,9 @@ def pyplot_for(what: str) -> Any:
     try:
         import matplotlib
 
-        matplotlib.use("Agg")
+        # What a notebook, say, has chosen for its own figures stays as it is.
+        if "matplotlib.pyplot" not in sys.modules:
+            matplotlib.use("Agg")
         from matplotlib import pyplot
     except ImportError as error:
         cause = f"{what} needs matplotlib, which is not installed"
