@@ -6,13 +6,16 @@
     result = cj.train(config, run_dir="runs/notebook")
     print(cj.evaluate(result.agent, tasks=["window-close"], k=(0, 2, 10)).table())
 
-What it offers is described in `cmrl_jax.api`, and imported when it is first used.
+What it offers is described in `cmrl_jax.api`, and imported when it is first used. Importing it
+makes the tasks known to Gymnasium: `gymnasium.make("cmrl_jax/window-open-v0")`.
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from envs.adapters.gymnasium_ids import register
 
 if TYPE_CHECKING:
     from cmrl_jax.api import (
@@ -55,6 +58,8 @@ __all__ = [
     "register_environment",
     "train",
 ]
+
+register()
 
 
 def __getattr__(name: str) -> Any:

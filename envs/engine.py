@@ -23,10 +23,10 @@ def _import_mujoco() -> None:
         importlib.import_module("mujoco")
     finally:
         os.environ["MUJOCO_GL"] = wished  # for processes that this one starts
-    _load_gl()
+    load_gl()
 
 
-def _load_gl() -> None:
+def load_gl() -> None:
     """Gives the imported MuJoCo the library that MUJOCO_GL names, if it can be had."""
     platform = os.environ.get("PYOPENGL_PLATFORM")
     try:
@@ -42,4 +42,4 @@ def _load_gl() -> None:
 _import_mujoco()
 import mujoco  # noqa: E402
 
-__all__ = ["mujoco"]
+__all__ = ["load_gl", "mujoco"]

@@ -1,9 +1,10 @@
 """`train.py bench`: figures of this machine, as JSON rows that are flushed one by one.
 
-Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench/physics.py` and
-`bench/stages.py`; here are the learner (gradient steps) and the start (seconds from the command to
-the end of the first iteration, with an empty and a filled compilation cache, and peak memory), both
-of the main job. `bench/launches.py` counts the kernels that a step starts on a GPU.
+Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench/physics.py`,
+`bench/stages.py` and `bench/vector_envs.py`; here are the learner (gradient steps) and the start
+(seconds from the command to the end of the first iteration, with an empty and a filled compilation
+cache, and peak memory), both of the main job. `bench/launches.py` counts the kernels that a step
+starts on a GPU.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from cmrl_jax.bench import physics as bench_physics
 from cmrl_jax.bench import stages as bench_stages
 from cmrl_jax.bench.launches import bench_launches, check_wheels
 from cmrl_jax.bench.physics import best_seconds
+from cmrl_jax.bench.vector_envs import bench_gymnasium
 from cmrl_jax.commands import CHILD
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import Config, ConfigError, call_envs
@@ -146,6 +148,7 @@ KINDS = {
     "rollout": lambda config, report: bench_physics.bench_rollout(report),
     "metaworld": lambda config, report: bench_physics.bench_metaworld(report),
     "metaworld_vector": lambda config, report: bench_physics.bench_metaworld_vector(report),
+    "gymnasium": lambda config, report: bench_gymnasium(report),
     "learner": bench_learner,
     "start": bench_start,
     "launches": lambda config, report: bench_launches(CONFIG, report),

@@ -127,8 +127,8 @@ def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, re
     )
     console = consoles[0]
     if outcome.is_finished:
-        console.message(f"done in {format_duration(outcome.wall_s)}: {place}")
         _report([run for _, run in runs], place, console)
+        console.message(f"done in {format_duration(outcome.wall_s)}: {place}")
         return 0
     text = f"stopped after iteration {outcome.iteration}; "
     text += f"go on with: {command('--run', place, '--resume')}"

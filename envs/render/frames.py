@@ -58,15 +58,24 @@ def camera_of(task: str, placement: np.ndarray) -> Camera:
 
 def metaworld_scene(task: str, placement: np.ndarray) -> mujoco.MjModel:
     """Meta-World's scene of a task with fixture and goal mark where its reset puts them."""
-    from envs.physics.model import FIXTURE_ROOT, load_scene
+    from envs.physics.model import load_scene
+    from envs.tasks import task_id
+    from envs.tasks.specs import SPECS
+
+    model = load_scene(SPECS[task_id(task)].scene)
+    place(model, task, placement)
+    return model
+
+
+def place(model: mujoco.MjModel, task: str, placement: np.ndarray) -> None:
+    """Moves fixture and goal mark of a task's scene to a `placement` (3,), metres."""
+    from envs.physics.model import FIXTURE_ROOT
     from envs.tasks import task_id
     from envs.tasks.specs import SPECS
 
     spec = SPECS[task_id(task)]
-    model = load_scene(spec.scene)
     model.body(FIXTURE_ROOT[spec.scene]).pos = placement
     model.site("goal").pos = placement + np.array(spec.target)
-    return model
 
 
 def choose_gl() -> None:
