@@ -276,15 +276,11 @@ def python(code, **environment):
     [
         "import cmrl_jax, gymnasium",
         "import gymnasium, cmrl_jax",
-        "import importlib.util, cmrl_jax; importlib.util.find_spec('gymnasium'); import gymnasium",
         "import cmrl_jax, gymnasium, importlib; importlib.reload(cmrl_jax)",
     ],
 )
 def test_the_ids_are_known_whatever_is_imported_first(begin):
     show = "import sys; assert 'jax' not in sys.modules and 'mujoco' not in sys.modules\n"
-    show += "assert not [f for f in sys.meta_path if 'envs' in type(f).__module__]\n"
-    show += "loaders = {type(gymnasium.__loader__), type(gymnasium.__spec__.loader)}\n"
-    show += "assert loaders == {type(gymnasium.envs.__loader__)}\n"
     show += "print(*(name for name in gymnasium.registry if 'cmrl' in name))"
     assert python(f"{begin}\n{show}") == [env_id(task) for task in TASKS]
     assert env_id("window-open") == WINDOW
@@ -293,11 +289,6 @@ def test_the_ids_are_known_whatever_is_imported_first(begin):
 def test_an_id_may_name_the_library_that_registers_it():
     code = f"import gymnasium; print(gymnasium.make('cmrl_jax:{WINDOW}').spec.id)"
     assert python(code) == [WINDOW]
-
-
-def test_importing_the_library_imports_neither_gymnasium_nor_numpy():
-    code = "import cmrl_jax, sys; print(*({'gymnasium', 'numpy', 'jax'} & set(sys.modules)))"
-    assert python(code) == []
 
 
 PICTURES = f"""
