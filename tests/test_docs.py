@@ -18,6 +18,8 @@ from cmrl_jax.cli.flags import COMMANDS
 from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import find_config, read_yaml, resolve
 from cmrl_jax.config.schema import Config, leaves
+from cmrl_jax.evaluation.options import check_run
+from cmrl_jax.storage.run_dir import find_run
 from envs.parity import __main__ as parity
 from scripts.make_site import (
     GENERATORS,
@@ -75,7 +77,9 @@ def check_train_py(words: list[str]) -> None:
         given = {name: value for name, value in vars(flags).items() if name in keys}
         resolve(*read_yaml(find_config(flags.config)), flags=given)
     elif command in ("eval", "sweep"):
-        evaluate_flags.options_of(flags)
+        options = evaluate_flags.options_of(flags)
+        if command == "eval" and flags.run.parts[0] not in ("runs", "DIR"):  # one that is kept
+            check_run(options, find_run(flags.run))
     elif command == "finetune":
         finetune_flags.options_of(flags)
 
