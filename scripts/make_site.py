@@ -114,7 +114,7 @@ def stage() -> None:
             if source.suffix != ".md":
                 _put(source, (ROOT / source).read_bytes())
         filled = re.sub(GENERATED, lambda name: GENERATORS[name[1]](), text)
-        _put(page, filled.encode())
+        _put(page, bars(filled).encode())
     _put(Path("docs/site.css"), (ROOT / "docs/site.css").read_bytes())
 
 
@@ -122,6 +122,15 @@ def _put(place: Path, content: bytes) -> None:
     target = SOURCES / place
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(content)
+
+
+def bars(text: str) -> str:
+    """A page without the mark before a bar in code of a table: GitHub needs it, a site shows it."""
+    return re.sub(r"^\|.*", lambda row: _bars(row[0]), text, flags=re.MULTILINE)
+
+
+def _bars(row: str) -> str:
+    return re.sub("`[^`]*`", lambda code: code[0].replace("\\|", "|"), row)
 
 
 def commands_page() -> str:

@@ -25,6 +25,7 @@ from scripts.make_site import (
     GENERATORS,
     SITE,
     SOURCES,
+    bars,
     broken,
     commands_page,
     configuration_page,
@@ -135,6 +136,10 @@ def test_links_in_code_are_none():
     assert links(text) == ["b.md", "q.png"]
 
 
+def test_bars_in_code_of_a_table_need_no_mark():
+    assert bars("| `a\\|b` | c\\|d |\n`e\\|f`\n") == "| `a|b` | c\\|d |\n`e\\|f`\n"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=str)
 def test_snippets_use_what_there_is(page):
     """Blocks of Python parse, and take from `cj` what `import cmrl_jax` offers."""
@@ -178,4 +183,5 @@ def test_the_site_builds_strictly():
         assert (SITE / page.parent / f"{name}.html").is_file(), page
     reference = (SOURCES / "docs/reference/configuration.md").read_text()
     assert GENERATORS["configuration"]() in reference
+    assert "mjx\\|native" not in (SITE / "index.html").read_text()
     assert "register_environment" in (SITE / "docs/reference/python.html").read_text()
