@@ -7,7 +7,7 @@ ARGS =
 PY = $(VENV)/bin/python
 STAMP = $(VENV)/.cmrl-installed
 
-.PHONY: train test test-all lint smoke bench parity lock env
+.PHONY: train test test-all lint smoke bench parity docs lock env
 
 train: $(STAMP)
 	$(PY) train.py --config $(CONFIG) $(ARGS)
@@ -36,6 +36,10 @@ bench: $(STAMP)
 
 parity: $(STAMP)
 	$(PY) -m envs.parity --policies --json parity.json $(ARGS)
+
+# The site, strictly: a link that leads nowhere or a name that the code has not fails.
+docs: $(STAMP)
+	$(PY) scripts/make_site.py
 
 # The newest versions: make lock ARGS=--upgrade. Names and versions only, the same for 3.12 and
 # 3.13 (checked by a dry run for each that uv finds); the cuda extra stays outside.

@@ -74,7 +74,8 @@ def register_environment(
     """Makes `env.name: NAME` known to this process.
 
     Args:
-        tasks, make: see `Environment`.
+        tasks: see `Environment`.
+        make: see `Environment`.
 
     Raises:
         ValueError: the name is taken, or one of its tasks is another environment's.
@@ -94,7 +95,8 @@ def register_algorithm(name: str, make: str | Callable[..., Any], rules: Any) ->
     """Makes `algorithm: NAME` known to this process.
 
     Args:
-        make, rules: see `AlgorithmEntry`.
+        make: see `AlgorithmEntry`.
+        rules: see `AlgorithmEntry`.
 
     Raises:
         ValueError: the name is taken.

@@ -49,7 +49,8 @@ class Logger:
 
         Args:
             row: the last one whose iteration the filmed policy has done.
-            video, sheet: an mp4, and a PNG of frames of it.
+            video: an mp4.
+            sheet: a PNG of frames of it.
         """
 
     def message(self, text: str) -> None:
