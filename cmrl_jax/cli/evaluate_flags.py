@@ -52,7 +52,7 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         "--k",
         type=adaptation,
         metavar="0,1,2",
-        help="adaptation episodes [eval.final_k; but for --adapt posterior 0,1,2,5,10,20]",
+        help="adaptation episodes [eval.final_k of the run; 0,1,2,5,10,20 with --adapt search]",
     )
     add("--tasks", type=names, metavar="A,B", help="tasks to evaluate [those of the run]")
     add("--goals", type=goal_count, default=GOALS, metavar="N", help="goals a task, 1 to 50 [50]")

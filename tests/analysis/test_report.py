@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def figures_in(page):
     return [(title, plain(json.loads(data)["data"])) for title, data in cells]
 
 
-def plain(value):
+def plain(value: Any) -> Any:
     """plotly's JSON with its packed arrays as lists."""
     if isinstance(value, list):
         return [plain(item) for item in value]

@@ -5,6 +5,7 @@ import dataclasses
 import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,8 @@ def offline(monkeypatch):
 
 class Told(Logger):
     def __init__(self):
-        self.films, self.messages = [], []
+        self.films: list[Any] = []
+        self.messages: list[str] = []
 
     def film(self, task, row, video, sheet):
         self.films.append((task, row["iteration"], video.read_bytes()))
@@ -86,7 +88,7 @@ def test_two_runs_of_one_process_are_two_of_wandb(tmp_path, offline):
 )
 def test_a_missing_package_names_its_cure(monkeypatch, key, module):
     monkeypatch.setitem(sys.modules, module, None)
-    config = dataclasses.replace(Config(), log=LogConfig(**{key: 1 if key != "wandb" else True}))
+    config = load_config("smoke", {f"log.{key}": "1" if key == "video_every" else "true"})
     with pytest.raises(ConfigError, match=f"log.{key}") as raised:
         loggers_of(Console(stream=sys.stderr), config)
     assert "pip install 'cmrl-jax[" in raised.value.cure
