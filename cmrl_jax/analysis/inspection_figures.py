@@ -32,7 +32,7 @@ def _title(name: str, inspection: Inspection, shared: str) -> str:
     return title if shared else f"{title}\n{_episodes_of(inspection)}"
 
 
-def _row_name(inspection: Inspection, task: str) -> str:
+def row_name(inspection: Inspection, task: str) -> str:
     return task + (" (held out)" if inspection.is_held_out(task) else "")
 
 
@@ -101,7 +101,7 @@ def _heat_map(figure: Any, axis: Any, inspection: Inspection) -> None:
     axis.set_ylim(tasks, 0)
     axis.set_xticks(ticks, [f"{n % modules + 1}" for n in range(len(ticks))], fontsize=8)
     axis.set_xlabel("module", fontsize=8)
-    names = [_row_name(inspection, task) for task in inspection.tasks]
+    names = [row_name(inspection, task) for task in inspection.tasks]
     axis.set_yticks(np.arange(tasks) + 0.5, names, fontsize=9)
     axis.tick_params(length=0)
     axis.spines[:].set_visible(False)
@@ -165,7 +165,7 @@ def _latent_panel(axis: Any, inspection: Inspection) -> None:
     centre, axes, shares = principal_axes(latents.z.reshape(-1, latents.z.shape[-1]))
     project = lambda x: ((x - centre) @ axes.T).T
     for row, task in enumerate(inspection.tasks):
-        color, label = f"C{task_names().index(task)}", _row_name(inspection, task)
+        color, label = f"C{task_names().index(task)}", row_name(inspection, task)
         if latents.kl is not None:
             label += f": {latents.kl[row]:.2f}"
         if latents.text_kl is not None:

@@ -38,6 +38,7 @@ from cmrl_jax.storage.run_groups import shown_names
 from envs.outputs import replacing, written_by
 
 VERSIONS = "versions.json"
+Presets = Mapping[Path, tuple[str, dict[str, Any]]]  # of each run: see `preset_of`
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,8 @@ def _read(files: Sequence[Path]) -> Files:
 
 def _page(go: Any, runs: Runs, paths: Sequence[Path], files: Files) -> Iterable[str]:
     """The page's sections, those that there is something to show for."""
-    yield _section("What was run", _run_table(runs, paths))
+    presets = {path: preset_of(runs.configs[path]) for path in paths}
+    yield _section("What was run", _run_table(runs, presets))
     if len(runs.groups) > 1:
         yield _legend(runs.groups)
     yield _section("Success over training", _panels(go, runs, figures.success_panel), _SUCCESS)
@@ -105,7 +107,7 @@ def _page(go: Any, runs: Runs, paths: Sequence[Path], files: Files) -> Iterable[
     yield from _file_sections(go, files)
     yield from _inspections(go, paths)
     yield from _films(paths)
-    yield _section("To do it again", _commands(runs, paths))
+    yield _section("To do it again", _commands(runs, presets))
 
 
 def _section(title: str, body: str, note: str = "") -> str:
@@ -113,14 +115,15 @@ def _section(title: str, body: str, note: str = "") -> str:
     return f"<section><h2>{html.escape(title)}</h2>{told}{body}</section>\n"
 
 
-def _run_table(runs: Runs, paths: Sequence[Path]) -> str:
+def _run_table(runs: Runs, presets: Presets) -> str:
     head = ["run", "configuration", "seed", "env steps", "time", "device", "commit, date", "faults"]
     lines = []
-    for name, path in zip(shown_names(paths), paths, strict=True):
+    for name, (path, (preset, changed)) in zip(
+        shown_names(list(presets)), presets.items(), strict=True
+    ):
         config, rows = runs.configs[path], runs.rows[path]
-        preset, changed = preset_of(config)
-        changed.pop("seed", None)
-        flags = "<br>".join(html.escape(f"{key}: {shown(value)}") for key, value in changed.items())
+        keys = (f"{key}: {shown(value)}" for key, value in changed.items() if key != "seed")
+        flags = "<br>".join(map(html.escape, keys))
         made = _versions(path)
         commit = str(made.get("commit") or "not recorded")[:8]
         packages = ", ".join(f"{p} {made[p]}" for p in ("jax", "mujoco", "python") if p in made)
@@ -275,10 +278,9 @@ def _data(kind: str, path: Path) -> str:
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}"
 
 
-def _commands(runs: Runs, paths: Sequence[Path]) -> str:
+def _commands(runs: Runs, presets: Presets) -> str:
     lines = []
-    for path in paths:
-        preset, changed = preset_of(runs.configs[path])
+    for path, (preset, changed) in presets.items():
         flags = [word for key, value in changed.items() for word in (f"--{key}", shown(value))]
         lines.append(f"python train.py {quoted('--config', preset, *flags, '--run', path)}")
         if (found := runs.evaluations.get(path)) is not None:

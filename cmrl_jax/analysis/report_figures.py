@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cmrl_jax.analysis.inspection_figures import CIRCLE
+from cmrl_jax.analysis.inspection_figures import CIRCLE, row_name
 from cmrl_jax.analysis.inspection_file import Inspection
 from cmrl_jax.analysis.pca import principal_axes
 from cmrl_jax.analysis.run_set import Runs, Series, band
@@ -101,7 +101,7 @@ def routing_map(go: Any, inspection: Inspection) -> Any:
     figure.add_heatmap(
         z=flat(usage.mean),
         x=columns,
-        y=[task_label(inspection, task) for task in inspection.tasks],
+        y=[row_name(inspection, task) for task in inspection.tasks],
         customdata=np.stack([flat(usage.low), flat(usage.high)], -1),
         hovertemplate="%{y}<br>module %{x}: %{z:.2f}<br>its readers: %{customdata[0]:.2f} to "
         "%{customdata[1]:.2f}<extra></extra>",
@@ -133,7 +133,7 @@ def latents_scatter(go: Any, inspection: Inspection) -> Any:
     )
     for row, task in enumerate(inspection.tasks):
         style: dict[str, Any] = {"color": color(task_names().index(task))}
-        name = task_label(inspection, task)
+        name = row_name(inspection, task)
         hover = f"{name}<br>%{{x:.2f}}, %{{y:.2f}}<extra>z drawn</extra>"
         mean = hover.replace("z drawn", "posterior's mean")
         _add_points(figure, project(latents.z[row]), style | {"size": 4, "opacity": 0.5}, hover)
@@ -153,10 +153,6 @@ def latents_scatter(go: Any, inspection: Inspection) -> Any:
         )
     figure.update_yaxes(scaleanchor="x")
     return figure
-
-
-def task_label(inspection: Inspection, task: str) -> str:
-    return task + (" (held out)" if inspection.is_held_out(task) else "")
 
 
 def _figure(

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 from cmrl_jax.commands import program
 from cmrl_jax.config.schema import MOST_EPISODES, MOST_STEPS, ConfigError, call_envs
-from envs.command_line import Parser, suggest, whole
+from envs.command_line import Parser, suggest, typed_path, whole
 from envs.goal_names import GOALS, LARGEST_SEED
 from envs.outputs import FORCE_HELP
 
@@ -53,6 +53,18 @@ adaptation = list_of(episodes)
 def names(text: str) -> tuple[str, ...]:
     """Words, comma separated, as an argparse type."""
     return tuple(item.strip() for item in text.split(",") if item.strip())
+
+
+def add_runs(parser: argparse.ArgumentParser) -> None:
+    """Adds `--run` of the commands that show several runs together."""
+    parser.add_argument(
+        "--run",
+        metavar="DIR",
+        type=typed_path,
+        required=True,
+        action="append",
+        help="run directory, again for more; DIR-seed0, DIR-seed1 of one config are one band",
+    )
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from cmrl_jax.cli.flags import add_force
+from cmrl_jax.cli.flags import add_force, add_runs
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.storage.run_dir import find_run
@@ -20,14 +20,7 @@ PICTURES = ("success.png", "returns.png", "bars.png", "k_shot.png", "routing.png
 
 def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     """Adds the flags of `plot`."""
-    parser.add_argument(
-        "--run",
-        metavar="DIR",
-        type=typed_path,
-        required=True,
-        action="append",
-        help="run directory, again for more; DIR-seed0, DIR-seed1 of one config are one band",
-    )
+    add_runs(parser)
     parser.add_argument(
         "--out", metavar="DIR", type=typed_path, help="directory [plots/ of the first]"
     )

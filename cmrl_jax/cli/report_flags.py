@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from cmrl_jax.cli.flags import add_force
+from cmrl_jax.cli.flags import add_force, add_runs
 from envs.command_line import typed_path
 
 DESCRIPTION = "Writes runs as one web page that needs no network: curves, tables, z, films."
@@ -12,14 +12,7 @@ DESCRIPTION = "Writes runs as one web page that needs no network: curves, tables
 
 def add_flags(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     """Adds the flags of `report`."""
-    parser.add_argument(
-        "--run",
-        metavar="DIR",
-        type=typed_path,
-        required=True,
-        action="append",
-        help="run directory, again for more; DIR-seed0, DIR-seed1 of one config are one band",
-    )
+    add_runs(parser)
     parser.add_argument(
         "--json",
         metavar="F",

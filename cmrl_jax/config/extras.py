@@ -6,12 +6,13 @@ import importlib.util
 
 from cmrl_jax.config.schema import Config, ConfigError
 
+_FILMS = ("viz", {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"})
 # What needs them -> the extra of pyproject.toml, and module -> package.
 NEEDS = {
     "log.tensorboard": ("viz", {"tensorboardX": "tensorboardX"}),
     "log.wandb": ("wandb", {"wandb": "wandb"}),
-    "log.video_every": ("viz", {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}),
-    "render": ("viz", {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}),
+    "log.video_every": _FILMS,
+    "render": _FILMS,
     "report": ("viz", {"plotly": "plotly"}),
 }
 

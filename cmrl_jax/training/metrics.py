@@ -129,3 +129,9 @@ def metric_row(metrics: dict[str, Any], tasks: tuple[str, ...]) -> dict[str, flo
         for column, figure in zip(metric_names({name: value}, tasks), values, strict=True):
             row[column] = None if np.isnan(figure) else float(figure)
     return row
+
+
+def figures_of(row: Row) -> dict[str, float]:
+    """What was taken in a row, without the columns that every row has."""
+    taken = row.items()
+    return {n: float(v) for n, v in taken if n not in LEADING_COLUMNS and v is not None}

@@ -11,7 +11,7 @@ from typing import Any
 from cmrl_jax.config.extras import require_extra
 from cmrl_jax.training.films import FOLDER
 from cmrl_jax.training.logger import Logger, Progress, RunInfo
-from cmrl_jax.training.metrics import LEADING_COLUMNS, Row
+from cmrl_jax.training.metrics import Row, figures_of
 
 
 class TensorBoard(Logger):
@@ -74,9 +74,8 @@ class TensorBoard(Logger):
 
     def _add_row(self, row: Row) -> None:
         event = self._event(step=int(row["env_steps"]), wall_time=self._begun + row["wall_s"])
-        for name, value in row.items():
-            if name not in LEADING_COLUMNS and value is not None:
-                event.summary.value.add(tag=name, simple_value=float(value))
+        for name, value in figures_of(row).items():
+            event.summary.value.add(tag=name, simple_value=value)
         self._add(event)
 
     def _add(self, event: Any) -> None:

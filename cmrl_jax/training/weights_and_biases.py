@@ -12,7 +12,7 @@ from cmrl_jax.config.files import to_dict
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.storage.run_dir import write_text
 from cmrl_jax.training.logger import Logger, Progress, RunInfo
-from cmrl_jax.training.metrics import LEADING_COLUMNS, Row
+from cmrl_jax.training.metrics import Row, figures_of
 
 PROJECT = "cmrl_jax"  # where WANDB_PROJECT names no other
 
@@ -65,12 +65,7 @@ class WeightsAndBiases(Logger):
         self._run.log({f"film/{task}": self._wandb.Video(str(video), format="mp4")})
 
     def _add(self, row: Row) -> None:
-        figures = {
-            name: float(value)
-            for name, value in row.items()
-            if name not in LEADING_COLUMNS and value is not None
-        }
-        self._run.log(figures, step=int(row["env_steps"]))
+        self._run.log(figures_of(row), step=int(row["env_steps"]))
 
     def close(self) -> None:
         if self._run is not None:
