@@ -115,8 +115,11 @@ def wandb_points(directory):
 
     Films, which are files to W&B, are left out.
     """
+    import wandb
     from wandb.proto import wandb_internal_pb2
 
+    # A process of W&B's own writes the files, and goes on after a run has finished; this waits.
+    wandb.teardown()
     proto: Any = wandb_internal_pb2
     points = {}
     for path in sorted(directory.glob("offline-run-*/*.wandb")):
