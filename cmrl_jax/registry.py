@@ -50,6 +50,12 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "cmrl": AlgorithmEntry(
         "cmrl_jax.algorithms.cmrl.algorithm:make", "cmrl_jax.algorithms.cmrl.rules:Rules"
     ),
+    "rl2": AlgorithmEntry(
+        "cmrl_jax.algorithms.rl2.algorithm:make", "cmrl_jax.algorithms.rl2.rules:Rules"
+    ),
+    "maml": AlgorithmEntry(
+        "cmrl_jax.algorithms.maml.algorithm:make", "cmrl_jax.algorithms.maml.rules:Rules"
+    ),
 }
 
 

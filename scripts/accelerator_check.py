@@ -29,6 +29,7 @@ sys.path[:0] = [str(ROOT)]
 import cmrl_jax as cj  # noqa: E402
 from cmrl_jax.cli.flags import add_force, names, parse, whole  # noqa: E402
 from cmrl_jax.config.schema import ConfigError, require  # noqa: E402
+from cmrl_jax.evaluation.session import prepare_jax  # noqa: E402
 from cmrl_jax.storage.output_files import writable  # noqa: E402
 from envs.command_line import Parser, suggest, typed_path  # noqa: E402
 from envs.outputs import written_by  # noqa: E402
@@ -36,6 +37,7 @@ from scripts.experiments import refused  # noqa: E402
 
 # One evaluation of 20 places a task, by the sentence alone, in every second iteration at most.
 WATCHED = {"eval.every": 0.01, "eval.wall_share": 0.5, "eval.goals": 20, "eval.k": (0,)}
+COMMAND = "accelerator_check"  # whose mark the file has
 LANES = (256, 2048, 8192, 32768)
 
 
@@ -130,6 +132,8 @@ def learn(name: str, config_file: str, size: Size, seeds: int, began: float) -> 
 
     def on_learned() -> None:
         times = [watch.learned for watch in watches if watch.learned]
+        add("seeds_that_learned", len(times), "1")
+        add("newest_learned_s", max(times) - began, "s")
         if len(times) == seeds:
             add("learned_s", max(times) - began, "s")
             add("learned_env_steps", max(watch.env_steps for watch in watches), "1")
@@ -141,12 +145,11 @@ def learn(name: str, config_file: str, size: Size, seeds: int, began: float) -> 
 
     with tempfile.TemporaryDirectory() as folder:
         cj.train(config, Path(folder) / "run", seeds=seeds, loggers=loggers, stop=stop)
-    add("seeds_that_learned", sum(watch.learned is not None for watch in watches), "1")
+    if not any(watch.learned for watch in watches):
+        add("seeds_that_learned", 0, "1")
 
 
 def device(size: Size, began: float) -> None:
-    from cmrl_jax.evaluation.session import prepare_jax
-
     print(json.dumps({"device": prepare_jax(cj.load_config(size.main))}), flush=True)
 
 
@@ -175,6 +178,12 @@ def naive(size: Size, began: float) -> None:
 
 
 # Name -> what it does, and the seconds that it may take at most.
+def play(name: str, size: Size, began: float) -> None:
+    """A part, in the process that is its own."""
+    prepare_jax(cj.load_config(size.main))  # its precision holds for what builds no run, too
+    PARTS[name][0](size, began)
+
+
 PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
     "device": (device, 60),
     "main": (lambda s, t: learn("main", s.main, s, 1, t), 300),
@@ -192,7 +201,8 @@ PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
 def run_part(name: str, toy: bool, cache: Path, seconds: float) -> Iterator[dict[str, Any]]:
     """Rows of a part in a process of its own, as it finds them, and last how it ended."""
     command = [sys.executable, __file__, "--part", name, "--began", str(time.time())]
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
+    # What it leaves lying when it is cut off goes with the folder of all.
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "TMPDIR": str(cache)}
     started = time.monotonic()
     with subprocess.Popen(
         command + ["--toy"] * toy, stdout=subprocess.PIPE, text=True, env=environment
@@ -220,7 +230,7 @@ def check(minutes: int, path: Path, chosen: Sequence[str], toy: bool) -> int:
     from cmrl_jax.bench.main import Report
 
     end, failed = time.monotonic() + 60 * minutes, False
-    report = Report(path, "unknown")
+    report = Report(path, "unknown", COMMAND)
     with tempfile.TemporaryDirectory() as cache:
         for name in ("device", *chosen):
             seconds = min(PARTS[name][1], end - time.monotonic())
@@ -253,12 +263,12 @@ def main(words: Sequence[str]) -> int:
         print("\n".join(others))
         return 0
     if args.part:
-        PARTS[args.part][0](TOY if args.toy else Size(), args.began)
+        play(args.part, TOY if args.toy else Size(), args.began)
         return 0
     for name in args.parts:
         cure = f"{suggest(name, others)}choose from: {', '.join(others)}"
         require(name in others, f"unknown part '{name}'", cure)
-    writable(args.json, "--json", written_by("bench"), args.force)
+    writable(args.json, "--json", written_by(COMMAND), args.force)
     return check(args.minutes, args.json, args.parts, args.toy)
 
 

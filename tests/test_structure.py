@@ -51,7 +51,7 @@ LIGHT = {
     "stop",
     "streams",
     "algorithms.rules",
-    "algorithms.cmrl.rules",
+    *(f"algorithms.{name}.rules" for name in ("cmrl", "maml", "rl2")),
     *(f"config.{name}" for name in ("schema", "rules", "files", "yaml_tree", "extras")),
     *(f"storage.{name}" for name in ("run_dir", "documents", "run_files", "run_groups", "locks")),
     "storage.kept_policies",
@@ -160,8 +160,7 @@ def test_few_modules_lie_in_no_room():
 def test_each_library_has_its_room():
     assert importers("orbax") <= {"cmrl_jax.storage.checkpoint"}
     assert importers("flax.linen") <= {
-        "cmrl_jax.nn.networks",
-        "cmrl_jax.nn.layers",
+        *(f"cmrl_jax.nn.{name}" for name in ("networks", "layers", "gaussian_policy", "recurrent")),
         "cmrl_jax.text.clip_text",
     }
     assert importers("transformers") == {"cmrl_jax.text.clip_tokenizer", "cmrl_jax.text.minilm"}

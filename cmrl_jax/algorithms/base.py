@@ -41,8 +41,8 @@ class Agent(Protocol):
     Attributes:
         adapts: whether experience changes what it does.
         explores: whether an episode that it learns from differs from one that counts.
-        chunk: control steps that may pass between two calls of `observe`. Meta-World's own
-            evaluation shows a whole episode at once, when it has ended.
+        chunk: control steps that may pass between two calls of `observe`; 1 where it acts on what
+            it has just seen. Meta-World's own evaluation shows all others a whole episode at once.
     """
 
     @property

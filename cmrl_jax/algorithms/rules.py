@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from cmrl_jax.config.schema import Config, require
@@ -19,11 +20,13 @@ class AlgorithmRules:
         can_start_from_text: whether the sentence alone says something before any episode.
         kind: what the answers come from, in words for a message.
         on_bad_gradients: what to do about a run whose gradients are not finite.
+        seed_and_length_shape: whether its programs depend on the seed or on how long a run is.
         IDLE: keys, and with a dot whole sections, that training reads and a policy that acts does
             not.
     """
 
     IDLE: tuple[str, ...] = ()
+    seed_and_length_shape = True
     adapts = False
     ways: tuple[str, ...] = ("none",)
     reads_text = False
@@ -35,9 +38,17 @@ class AlgorithmRules:
         self.config = config
         self.kind = f"algorithm {config.algorithm}"
 
+    def steps_per_iteration(self) -> int:
+        """Control steps of all lanes in a training iteration."""
+        return self.config.collect.lanes * self.config.env.horizon
+
     def shaping(self) -> Config:
         """The configuration with what no program depends on at its default."""
         config, usual = self.config, Config()
+        if not self.seed_and_length_shape:
+            steps, minutes = usual.train.env_steps, usual.train.minutes
+            length = replace(config.train, env_steps=steps, minutes=minutes)
+            config = replace(config, seed=usual.seed, train=length)
         return replace(
             config,
             name=usual.name,
@@ -63,3 +74,12 @@ class AlgorithmRules:
 
     def check_devices(self, devices: int) -> None:
         """Raises ConfigError unless the work divides evenly among the devices."""
+
+
+def check_lanes(config: Config, devices: int) -> None:
+    """Raises ConfigError unless the lanes divide evenly among the devices."""
+    lanes, multiple = config.collect.lanes, math.lcm(len(config.tasks.train), devices)
+    cause = f"collect.lanes {lanes} cannot be divided among {devices} devices"
+    cure = f"set collect.lanes: {-(-lanes // multiple) * multiple}, or show fewer devices "
+    cure += "(CUDA_VISIBLE_DEVICES, JAX_NUM_CPU_DEVICES)"
+    require(lanes % devices == 0, cause, cure)

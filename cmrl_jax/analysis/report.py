@@ -10,10 +10,12 @@ import base64
 import html
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from string import Template
 from typing import Any
+
+import numpy as np
 
 from cmrl_jax.analysis import report_figures as figures
 from cmrl_jax.analysis.inspection_figures import verdict
@@ -23,7 +25,8 @@ from cmrl_jax.commands import quoted, shown
 from cmrl_jax.config.extras import require_extra
 from cmrl_jax.config.presets import preset_of
 from cmrl_jax.config.schema import call_envs
-from cmrl_jax.evaluation.statistics import interquartile_mean, wilson_interval
+from cmrl_jax.evaluation.options import EvalOptions
+from cmrl_jax.evaluation.statistics import interquartile_mean, seeds_band, wilson_interval
 from cmrl_jax.formats import format_duration
 from cmrl_jax.places import DATA
 from cmrl_jax.registry import task_names
@@ -35,6 +38,7 @@ from cmrl_jax.storage.run_files import (
     read_evaluation,
 )
 from cmrl_jax.storage.run_groups import shown_names
+from cmrl_jax.training.films import sheets_of
 from envs.outputs import replacing, written_by
 
 VERSIONS = "versions.json"
@@ -84,8 +88,9 @@ def _plotly() -> tuple[Any, str]:
 
 def _read(files: Sequence[Path]) -> Files:
     found = Files({}, {})
-    for path in files:
-        name = f"{path.parent.name}/{path.stem}"
+    names = [f"{path.parent.name}/{path.stem}" for path in files]
+    for short, path in zip(names, files, strict=True):
+        name = str(path.with_suffix("")) if names.count(short) > 1 else short
         if "curves" in read_json(path, "give a file that eval --json or finetune --json wrote"):
             found.adaptations[name] = read_adaptation(path)
         else:
@@ -181,8 +186,8 @@ def _grid(panels: Iterable[tuple[str, Any]]) -> str:
 
 def _drawn(figure: Any) -> str:
     """A figure as data, which the page's script draws once all of the page has its place."""
-    data = figure.to_json().replace("</", "<\\/")
-    return f'<div class=plot><script type="application/json">{data}</script></div>'
+    # plotly writes "<" and "/" of texts as \\u003c and \\u002f: none ends the script.
+    return f'<div class=plot><script type="application/json">{figure.to_json()}</script></div>'
 
 
 def _final_table(runs: Runs) -> str:
@@ -205,10 +210,11 @@ def _final_table(runs: Runs) -> str:
 
 
 def _interval(runs: Runs, group: str, rates: Sequence[float]) -> str:
-    """Of one run Wilson's over its goals; of several the range of the seeds."""
+    """95 %: of one run Wilson's over its goals, of several the bootstrap's over the seeds."""
     goals = {e.facts.get("goals") for e in runs.evaluations_of(group)}
     if len(rates) > 1:
-        return f"{min(rates):.2f} to {max(rates):.2f} ({len(rates)} seeds)"
+        _, low, high = seeds_band(np.array(rates)[:, None])
+        return f"{low[0]:.2f} to {high[0]:.2f} ({len(rates)} seeds)"
     (count,) = goals if len(goals) == 1 else (None,)
     if not isinstance(count, int) or count < 1:
         return ""
@@ -259,11 +265,14 @@ def _with_verdict(name: str, inspection: Inspection) -> str:
 
 
 def _films(paths: Sequence[Path]) -> Iterable[str]:
-    """Films that `render` has left in the runs, else its contact sheets."""
+    """Films that `render` has left in the runs, else the last that training did; or the sheets."""
     cells = []
     for name, path in zip(shown_names(paths), paths, strict=True):
-        for sheet in sorted((path / "render").glob("*.png")):
-            title = html.escape(f"{name}: {sheet.stem}")
+        trained = sheets_of(path)
+        newest = [(f"{n:,} steps, ", sheet) for n, sheet in trained if n == trained[-1][0]]
+        rendered = [("", sheet) for sheet in sorted((path / "render").glob("*.png"))]
+        for when, sheet in rendered or newest:
+            title = html.escape(f"{name}: {when}{sheet.stem}")
             film = sheet.with_suffix(".mp4")
             if film.is_file():
                 shown_film = f'<video controls muted loop src="{_data("video/mp4", film)}"></video>'
@@ -287,7 +296,7 @@ def _commands(runs: Runs, presets: Presets) -> str:
             k = ",".join(str(k) for k in next(iter(found.tasks.values())))
             words = ["--run", path, "--tasks", ",".join(found.tasks), "--k", k]
             words += ["--goal-set", found.facts.get("goal_set", "heldout")]
-            words += ["--goals", found.facts.get("goals", 50)]
+            words += [word for key, flag in _EVAL_FLAGS.items() for word in _flag(found, key, flag)]
             lines.append(f"python train.py eval {quoted(*words)}")
     return f"<pre>{html.escape(chr(10).join(lines))}</pre>"
 
@@ -299,11 +308,35 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<div class=wide><table><tr>{top}</tr>{body}</table></div>"
 
 
+def _flag(found: Evaluation, key: str, flag: str) -> list[Any]:
+    """A flag and its value, where an evaluation was taken with another than the usual one."""
+    usual, value = asdict(EvalOptions()).get(key), found.facts.get(key)
+    return [] if value in (None, "", usual) else [flag, value]
+
+
+# What an evaluation's file says of how it was taken -> the flag of `eval`.
+_EVAL_FLAGS = {
+    "goals": "--goals",
+    "seed": "--seed",
+    "draws": "--eval-seeds",
+    "horizon": "--horizon",
+    "physics": "--physics",
+    "policy": "--policy",
+    "z": "--z",
+    "adapt": "--adapt",
+    "protocol": "--protocol",
+    "paraphrases": "--paraphrases",
+    "text_control": "--text-control",
+    "text": "--text",
+}
 _SUCCESS = (
     "Episodes that training collected, exploring: at any step (line) and at the last (dotted). "
     "Marks: evaluations of the policy, crosses where the task was held out. Bands: 95 % over seeds."
 )
-_FINAL = "On places that training never sees, after k episodes of adaptation."
+_FINAL = (
+    "On places that training never sees, after k episodes of adaptation. Of several seeds: the "
+    "interquartile mean, and its bootstrap interval."
+)
 _ROUTING = "Mean weight with which each module of the actor is read; white is the equal share."
 _LATENT = (
     "Dots: z drawn; large: a posterior's mean; diamonds: of the sentence alone; circle: N(0, I)."

@@ -44,8 +44,8 @@ GRADIENT_STEPS = 100
 class Report:
     """The JSON file, rewritten after every row, so that a stopped run keeps its rows."""
 
-    def __init__(self, path: Path, device: str):
-        self._path = path
+    def __init__(self, path: Path, device: str, command: str = "bench"):
+        self._path, self._command = path, command
         self._document: dict[str, Any] = {
             "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "device": device,
@@ -65,7 +65,7 @@ class Report:
 
     def add(self, name: str, value: float, unit: str, **labels: Any) -> None:
         self._document["rows"].append({"name": name, "value": value, "unit": unit} | labels)
-        call_envs(lambda: write_json(self._path, "bench", self._document))
+        call_envs(lambda: write_json(self._path, self._command, self._document))
         shown = " ".join(f"{key}={label}" for key, label in labels.items())
         print(f"{name:<30} {value:>10.1f} {unit:<8} {shown}", flush=True)
 

@@ -34,6 +34,7 @@ from cmrl_jax.stop import is_interrupt
 from cmrl_jax.storage.output_files import distinct, writable
 from cmrl_jax.storage.run_dir import (
     find_run,
+    place_beside,
 )
 from envs.command_line import suggest, typed_path
 from envs.outputs import written_by
@@ -135,7 +136,7 @@ def _plot(words: list[str]) -> int:
 def _report(words: list[str]) -> int:
     args = parse(report_flags.add_flags(parser_of("report", report_flags.DESCRIPTION)), words)
     plot_flags.check_runs(args.run)
-    out = args.out or args.run[0] / "report.html"
+    out = args.out or place_beside(find_run(args.run[0])) / "report.html"
     writable(out, "--out", written_by("report"), args.force)
 
     from cmrl_jax.analysis import report

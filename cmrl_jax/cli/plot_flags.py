@@ -9,7 +9,7 @@ from pathlib import Path
 from cmrl_jax.cli.flags import add_force, add_runs
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import ConfigError
-from cmrl_jax.storage.run_dir import find_run
+from cmrl_jax.storage.run_dir import find_own_run, find_run
 from envs.command_line import typed_path
 
 DESCRIPTION = (
@@ -51,7 +51,7 @@ def check_inspectable(run: Path) -> None:
     Raises:
         ConfigError: it does not, or this version could not act by it.
     """
-    if not (find_run(run) / "policy").is_dir():
+    if not (find_own_run(run) / "policy").is_dir():
         cause = f"--inspect needs a policy checkpoint, and {run / 'policy'} does not exist"
         cure = "let the run reach one (checkpoint.policy_every), or leave --inspect out"
         raise ConfigError(cause, cure)

@@ -21,7 +21,7 @@ from cmrl_jax.evaluation.options import (
 )
 from cmrl_jax.registry import rules_of
 from cmrl_jax.storage.output_files import writable
-from cmrl_jax.storage.run_dir import find_run
+from cmrl_jax.storage.run_dir import find_run, place_beside
 from envs.command_line import make_directory, typed_path, whole
 from envs.outputs import written_by
 
@@ -75,7 +75,7 @@ def options_of(args: argparse.Namespace) -> tuple[Path, FilmOptions, Path]:
     require(config.env.name == "ml4", cause, "give a run of ml4: films show Meta-World's scenes")
     check_run(replace(asked, k=asked.k or (0,)), run)
     require_extra("render")
-    out = args.out or run / "render"
+    out = args.out or place_beside(run) / "render"
     call_envs(lambda: make_directory(out, "--out"))
     for task in evaluated_tasks(asked, config):
         for ending in ("mp4", "png"):

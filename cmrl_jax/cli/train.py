@@ -21,7 +21,7 @@ from cmrl_jax.config.files import (
 )
 from cmrl_jax.config.schema import Config, ConfigError, leaves, require
 from cmrl_jax.stop import Stop
-from cmrl_jax.storage.run_dir import all_begun, config_stem, find_run, runs_at, seed_dirs
+from cmrl_jax.storage.run_dir import all_begun, config_stem, find_own_run, runs_at, seed_dirs
 from cmrl_jax.streams import READER_LEFT, exit_code, to_stderr
 from cmrl_jax.text.goal_files import find_table
 from envs.command_line import typed_path, whole
@@ -80,7 +80,7 @@ def run_train(words: Sequence[str]) -> int:
     name, run, seeds, resume = (args.pop(key) for key in ("config", "run", "seeds", "resume"))
     if name is None and run is not None and resume:
         first = next(iter(seed_dirs(run).values()), run)
-        name = find_run(first) / "config.yaml"
+        name = find_own_run(first) / "config.yaml"
     if name is None:
         found = sorted({p.name for d in config_dirs()[1:] for p in d.glob("*.yaml")})
         raise ConfigError("no --config given", f"add --config with one of: {', '.join(found)}")

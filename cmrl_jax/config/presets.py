@@ -22,7 +22,7 @@ def preset_of(config: Config) -> tuple[str, dict[str, Any]]:
     own = _values(config)
     found: dict[str, dict[str, Any]] = {}
     named: dict[str, bool] = {}
-    for folder in config_dirs()[1:]:
+    for folder in config_dirs()[2:]:  # not where the user stands
         for path in sorted(folder.glob("*.yaml")):
             if path.name not in found:
                 preset = load_config(path)

@@ -176,8 +176,10 @@ class SacConfig:
     tau: float = doc(0.005, "target update rate a gradient step", above=0, high=1)
     n_step: int = doc(3, "control steps in the Bellman target", low=1)
     reward_scale: float = doc(1.0, "multiplies the (normalised) reward", above=0)
-    reward_norm: Literal["none", "global", "per_task"] = doc("per_task", "return normalisation")
-    return_max: float = doc(10.0, "G_max: normalised returns stay within this bound", above=0)
+    reward_norm: Literal["none", "global", "per_task"] = doc(
+        "per_task", "return normalisation, rl2's too"
+    )
+    return_max: float = doc(10.0, "G_max: normalised returns stay within it, rl2's too", above=0)
     task_reduce: Literal["mean", "sum"] = doc("mean", "reduction of the losses over task rows")
     loss_balance: Literal["none", "sac_temp"] = doc("none", "task weights in the losses")
     policy_reg: float = doc(0.0, "L2 on the actor's mean and log std")
@@ -192,6 +194,39 @@ class SacConfig:
     )
     grad_clip: float = doc(1.0, "global-norm clip of every network; 0: none")
     normalize_obs: bool = doc(True, "running mean and std of the observations")
+
+
+@dataclass(frozen=True)
+class PpoConfig:
+    gamma: float = doc(0.99, "discount a control step", above=0, high=1)
+    gae_lambda: float = doc(0.95, "lambda of generalised advantage estimation", high=1)
+    clip: float = doc(0.2, "epsilon: how far the ratio of two policies counts", above=0)
+    epochs: int = doc(5, "passes over the data of an iteration", above=0, high=MOST_UPDATES)
+    lr: float = doc(5.0e-4, "Adam learning rate", above=0)
+    grad_clip: float = doc(0.5, "global-norm clip", above=0)
+    entropy: float = doc(1.0e-3, "weight of the entropy before tanh, in the loss")
+    std_init: float = doc(0.8, "first standard deviation of actions before tanh", above=0)
+
+
+@dataclass(frozen=True)
+class Rl2Config:
+    episodes: int = doc(3, "episodes of a trial", above=0, high=MOST_EPISODES)
+    width: int = doc(128, "width of the GRU's hidden state", above=0)
+    hidden: int = doc(128, "width of the layers before and after it", above=0)
+    minibatches: int = doc(4, "minibatches of whole trials a pass", above=0)
+    value_weight: float = doc(0.5, "weight of the value's squared error")
+    reward_scale: float = doc(0.1, "reward scale in the input")
+
+
+@dataclass(frozen=True)
+class MamlConfig:
+    episodes: int = doc(
+        8, "episodes of an inner step; a task's lanes are groups of so many", above=0, high=10_000
+    )
+    inner_steps: int = doc(1, "inner gradient steps of a trial", above=0, high=100)
+    inner_lr: float = doc(0.1, "step size of an inner step", above=0)
+    hidden: tuple[int, ...] = doc((64, 64), "hidden widths of the policy", above=0)
+    kl: float = doc(5.0e-4, "weight of the KL from the policies that collected the inner data")
 
 
 @dataclass(frozen=True)
@@ -281,7 +316,9 @@ class Config:
     name: str = doc("cmrl", "name of the preset, recorded with the run")
     seed: int = doc(0, "seed of the whole run", high=LARGEST_SEED)
     algorithm: str = doc(
-        "cmrl", "registered algorithm; model, encoder, kl, sac and most of collect are cmrl's"
+        "cmrl",
+        "registered algorithm; model, encoder, kl, sac and most of collect are cmrl's, ppo is that "
+        "of rl2 and maml",
     )
     tasks: TasksConfig = TasksConfig()
     env: EnvConfig = EnvConfig()
@@ -290,6 +327,9 @@ class Config:
     encoder: EncoderConfig = EncoderConfig()
     kl: KlConfig = KlConfig()
     sac: SacConfig = SacConfig()
+    ppo: PpoConfig = PpoConfig()
+    rl2: Rl2Config = Rl2Config()
+    maml: MamlConfig = MamlConfig()
     collect: CollectConfig = CollectConfig()
     train: TrainConfig = TrainConfig()
     eval: EvalConfig = EvalConfig()

@@ -31,7 +31,7 @@ from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.evaluation.cells import Row
 from cmrl_jax.evaluation.episode import Episode
 from cmrl_jax.evaluation.evaluator import Trial, lane_names
-from cmrl_jax.evaluation.metaworld_agent import MetaWorldAgent
+from cmrl_jax.evaluation.metaworld_agent import MetaWorldAgent, is_recurrent
 from cmrl_jax.evaluation.options import EvalOptions, evaluated_tasks, ks_of
 from cmrl_jax.evaluation.scores import cell_rows, format_scores, summarise
 from cmrl_jax.evaluation.session import Policy, Session, load_policy, prepare_jax
@@ -126,7 +126,8 @@ def k_shot(
     lanes = min(environments or ENVIRONMENTS, len(goal))
     shown = session.config.env.goal_observable
     parts: dict[int, list[Episode]] = {n: [] for n in k}
-    envs = make_vector_env(task, placements[:lanes], lanes, horizon, shown, seed)
+    recurrent = is_recurrent(session.agent_of(adapt))
+    envs = make_vector_env(task, placements[:lanes], lanes, horizon, shown, seed, recurrent)
     try:
         envs.call("toggle_terminate_on_success", False)
         batches = [
@@ -247,7 +248,8 @@ def metaworlds_own(
     [task] = trial.tasks
     placements = np.repeat(trial.placements[0], trial.draws, axis=0)  # a goal once for each draw
     shown = session.config.env.goal_observable
-    envs = make_vector_env(task, placements, 1, horizon, shown, options.seed)
+    recurrent = is_recurrent(session.agent_of(options.adapt))
+    envs = make_vector_env(task, placements, 1, horizon, shown, options.seed, recurrent)
     # Goals come in the environment's own order: runs are numbered, sentences taken in turn.
     runs = [np.array([n]) for n in range(len(placements))]
     agent = agent_of(session, policy, trial, runs, horizon, options.seed, options.adapt)

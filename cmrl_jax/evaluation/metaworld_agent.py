@@ -10,6 +10,8 @@ NOTES
    of H transitions reach the memory.
 3. The memory takes an episode's transitions in when it is truncated, inside `step`; the next one is
    acted on them. `adapt` only freezes the memory: evaluation episodes act on it and add nothing.
+   A recurrent agent takes in each step with the next observation, which has its action and reward
+   in it (`make_vector_env`); after `adapt`, every episode begins with what it then knew.
 4. What the agent draws for an episode and the noise of its actions are what `Evaluator` draws for
    the same lane name and episode number; evaluation episodes go on counting where adaptation
    stopped.
@@ -51,13 +53,17 @@ class Timestep(Protocol):
     def truncated(self) -> np.ndarray: ...
 
 
+def is_recurrent(agent: Agent) -> bool:
+    """Whether an agent acts on what it has just seen."""
+    return agent.adapts and agent.chunk == 1
+
+
 class MetaWorldAgent:
     """Acts for a fixed number of lanes with one policy on one task.
 
     Args:
         env: the configuration's `env` section.
-        agent, params: what acts. It observes whole episodes: one that acts on what it observed
-            within an episode cannot be scored so.
+        agent, params: what acts.
         texts: text vectors (run, lane, G); adaptation run n takes row n modulo their number.
         lane_ids: names of the lanes' noise (run, lane), see `Evaluator`.
         train_row: the task's row among the training tasks, read where the policy is told the task.
@@ -90,6 +96,7 @@ class MetaWorldAgent:
         self._key = jax.random.key(seed)
         self._run = -1
         self._frozen = False
+        self._is_recurrent = is_recurrent(agent)
         self._programs = _compile(env, agent, params, horizon, deterministic)
 
     @property
@@ -109,7 +116,7 @@ class MetaWorldAgent:
         text = self._texts[self._run % len(self._texts)].astype(np.float32)
         self._lane_id = self._lane_ids[self._run % len(self._lane_ids)].astype(np.int32)
         told = Told(text, np.ones(lanes, np.float32), self._row)
-        self._memory = self._agent.init(told)
+        self._memory = self._adapted = self._agent.init(told)
         if self._z != "posterior":
             self._control = without_experience(self._z, told, self._agent.init)
         self._frozen = False
@@ -142,23 +149,25 @@ class MetaWorldAgent:
     def step(self, timestep: Timestep) -> None:
         """Remembers the transitions just made; an episode that ended goes into the memory."""
         ended = np.logical_or(timestep.terminated, timestep.truncated)
-        place = np.arange(self._lanes), self._count
-        self._transitions["obs"][place] = self._shown
-        self._transitions["action"][place] = timestep.action
-        self._transitions["reward"][place] = timestep.reward
-        self._pending = ~ended  # NOTE 2
-        if ended.any():
+        if not self._is_recurrent:
+            place = np.arange(self._lanes), self._count
+            self._transitions["obs"][place] = self._shown
+            self._transitions["action"][place] = timestep.action
+            self._transitions["reward"][place] = timestep.reward
+            self._pending = ~ended  # NOTE 2
             self._observe(ended)
-            self._begin(ended)
+        self._begin(ended)
 
     def adapt(self) -> None:
         """Freezes the memory (NOTE 3)."""
-        self._frozen = True
+        self._frozen, self._adapted = True, self._memory
 
     def go_on_learning(self) -> None:
         """Ends the freeze after one episode, which shares its number with the next (NOTE 4); no
         part of Meta-World's interface."""
         self._frozen = False
+        if self._is_recurrent:
+            self._memory = self._adapted
         self._episode -= 1
 
     def eval_action(self, observations: np.ndarray) -> np.ndarray:
@@ -175,9 +184,12 @@ class MetaWorldAgent:
         self._starts |= lanes
 
     def _act(self, observations: np.ndarray) -> np.ndarray:
-        obs = np.asarray(observations, np.float32)
+        obs, last = np.split(np.asarray(observations, np.float32), [OBS_SIZE], axis=-1)
+        goes_on = ~self._starts
         if self._starts.any():
-            source = self._memory if self._z == "posterior" else self._control
+            is_kept = self._frozen and self._is_recurrent
+            known = self._adapted if is_kept else self._memory
+            source = known if self._z == "posterior" else self._control
             self._memory, noise = self._programs.begin(
                 self._memory,
                 source,
@@ -192,7 +204,14 @@ class MetaWorldAgent:
             self._steps[self._starts] = 0
             self._starts[:] = False
         noise = self._noise[np.arange(self._lanes), self._steps]
-        actions, shown = self._programs.act(self._memory, obs, self._origin, noise)
+        shown = self._programs.shown(obs, self._origin)
+        if self._is_recurrent and goes_on.any():
+            action, reward = last[:, None, :ACTION_SIZE], last[:, ACTION_SIZE : ACTION_SIZE + 1]
+            step = {"obs": self._shown[:, None], "action": action, "reward": reward}
+            step["next_obs"] = np.asarray(shown)[:, None]
+            mask = goes_on[:, None].astype(np.float32)
+            self._memory = self._programs.observe(self._memory, step, mask)
+        actions = self._programs.act(self._memory, shown, noise)
         self._steps += 1
         self._acted[:] = True
         self._shown = np.asarray(shown)
@@ -200,7 +219,7 @@ class MetaWorldAgent:
 
     def _observe(self, ended: np.ndarray) -> None:
         """Adds the episodes of the lanes that ended to their memories, and forgets the steps."""
-        if not self._frozen:
+        if ended.any() and not self._frozen:
             steps = np.arange(self._horizon)[None] < self._count[:, None]
             mask = (steps & ended[:, None]).astype(np.float32)
             self._memory = self._programs.observe(self._memory, self._transitions, mask)
@@ -210,6 +229,7 @@ class MetaWorldAgent:
 class _Programs(NamedTuple):
     """The agent's jitted parts, parameters bound."""
 
+    shown: Callable[..., Any]
     act: Callable[..., Any]
     begin: Callable[..., Any]
     observe: Callable[..., Any]
@@ -221,11 +241,13 @@ def _compile(
     params = jax.device_put(params)
 
     @jit_repeated
-    def act(memory, obs, origin, noise):
-        shown = obs
-        if env.obs_mode == "canonical":
-            shown = canonical_obs(obs, origin, env.goal_observable)
-        return agent.act(params, memory, shown, noise, deterministic), shown
+    def shown(obs, origin):
+        is_canonical = env.obs_mode == "canonical"
+        return canonical_obs(obs, origin, env.goal_observable) if is_canonical else obs
+
+    @jit_repeated
+    def act(memory, obs, noise):
+        return agent.act(params, memory, obs, noise, deterministic)
 
     @jit_repeated
     def begin(memory, source, starts, key, episode, lane_id, exploit):
@@ -248,4 +270,4 @@ def _compile(
         whole = Transition(terminated=flag, truncated=flag, first=flag, **transitions)
         return agent.observe(params, memory, whole, mask)
 
-    return _Programs(act, begin, observe)
+    return _Programs(shown, act, begin, observe)

@@ -1,4 +1,4 @@
-"""All neural networks, as a record of pure functions; only this file and layers.py know linen.
+"""CMRL's networks, as a record of pure functions; only this file and layers.py know their linen.
 
 Every network takes features x (..., feature) and a conditioning zc that broadcasts against x's
 leading dims, e.g. x (task, batch, feature) with zc (task, 1, latent), or both (lane, ...).

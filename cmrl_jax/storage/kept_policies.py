@@ -21,3 +21,8 @@ def kept_policies(pattern: str = "*") -> dict[str, Path]:
     for folder in reversed(FOLDERS):
         found |= {path.parent.name: path.parent for path in folder.glob("*/config.yaml")}
     return {name: found[name] for name in sorted(fnmatch.filter(found, pattern))}
+
+
+def is_kept(path: Path) -> bool:
+    """Whether a directory is that of a policy that comes with the project, which is only read."""
+    return any(path.resolve().parent == folder.resolve() for folder in FOLDERS)

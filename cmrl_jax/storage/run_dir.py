@@ -20,7 +20,7 @@ from cmrl_jax.commands import command, quoted
 from cmrl_jax.config.files import check_resumable, read_yaml, to_yaml
 from cmrl_jax.config.rules import validate
 from cmrl_jax.config.schema import Config, ConfigError, call_envs, require
-from cmrl_jax.storage.kept_policies import kept_policies
+from cmrl_jax.storage.kept_policies import is_kept, kept_policies
 from cmrl_jax.storage.locks import lock
 from envs.command_line import brief, suggest, what_is
 
@@ -85,6 +85,23 @@ def find_run(path: Path) -> Path:
     raise ConfigError(f"run directory {brief(path)} {state}", suggest(str(path), kept) + cure)
 
 
+def find_own_run(path: Path) -> Path:
+    """`find_run`, for what writes into the run.
+
+    Raises:
+        ConfigError: also for a policy that comes with the project.
+    """
+    run = find_run(path)
+    cause = f"{path} comes with the project: it is scored, not gone on with or written to"
+    require(not is_kept(run), cause, f"train one of your own: {command('--config', 'ml4.yaml')}")
+    return run
+
+
+def place_beside(run: Path) -> Path:
+    """Where files about a run go that nobody gave a place: into it; `runs/NAME` if it is kept."""
+    return ROOT / run.name if is_kept(run) else run
+
+
 def resumed_run(stem: str, run: Path | None) -> Path:
     """The directory to resume: `run`, or the newest one of the config; also one of several seeds.
 
@@ -92,7 +109,7 @@ def resumed_run(stem: str, run: Path | None) -> Path:
         ConfigError: where there is none.
     """
     if run is not None:
-        return run if seed_dirs(run) else find_run(run)
+        return run if seed_dirs(run) else find_own_run(run)
     runs = runs_of(stem)
     if not runs:
         cause = f"--resume found no run of '{stem}' in {ROOT}/"

@@ -46,7 +46,6 @@ class Console(Logger):
             console = RichConsole(file=file, highlight=False, markup=False)
             self._progress = Bar(*columns, console=console, transient=True)
             self._bar = self._progress.add_task("training", total=1.0)
-            self._progress.start()
 
     @property
     def error(self) -> OSError | None:
@@ -55,6 +54,8 @@ class Console(Logger):
 
     def start(self, run: RunInfo) -> None:
         self._tasks = run.config.tasks.train
+        if self._progress is not None:
+            self._progress.start()
 
     def row(self, row: Row, progress: Progress) -> None:
         self.message(self._label + format_iteration(row, self._tasks, progress.seconds_left))

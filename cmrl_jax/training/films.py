@@ -6,9 +6,11 @@ on the CPU, at the lowest priority, by the policy checkpoint of its iteration.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -34,12 +36,13 @@ class Films(Logger):
     def __init__(self, told: Sequence[Logger]):
         require_extra("log.video_every")
         self._told = told
-        self._child: subprocess.Popen[str] | None = None
-        self._row: Row = {}
+        self._child: subprocess.Popen[bytes] | None = None
+        self._row: Row = {}  # of the film that is being made
+        self._due: Row | None = None
+        self._is_over = False
 
     def start(self, run: RunInfo) -> None:
         self._run_dir, self._every = run.run_dir, run.config.log.video_every
-        self._due: Row | None = None
 
     def row(self, row: Row, progress: Progress) -> None:
         """An iteration's policy is saved after its row: it is filmed when the next row comes."""
@@ -48,15 +51,19 @@ class Films(Logger):
             self._begin(self._due)
         done = int(row["iteration"]) + 1
         self._due = row if done % self._every == 0 else None
+        self._is_over = progress.share >= 1.0
 
     def close(self) -> None:
-        self._collect(wait=LONGEST_WAIT)
-        if self._child is None and self._due is not None:
-            self._begin(self._due)
+        """Waits for films where the run has come to its end; one that is stopped ends at once."""
+        if self._is_over:
             self._collect(wait=LONGEST_WAIT)
+            if self._child is None and self._due is not None:
+                self._begin(self._due)
+                self._collect(wait=LONGEST_WAIT)
         if self._child is not None:
             self._child.kill()
             self._child.wait()
+            self._said.close()
 
     @property
     def _out(self) -> Path:
@@ -68,13 +75,13 @@ class Films(Logger):
             return  # the run was stopped before it was saved
         self._row, self._due = row, None
         words = ["render", "--run", self._run_dir, "--checkpoint", iteration, "--out", self._out]
+        self._said = tempfile.TemporaryFile()  # a pipe that nobody empties would hold it up
         self._child = subprocess.Popen(
             [sys.executable, "-c", CHILD, *map(str, words)],
             env=os.environ | {"JAX_PLATFORMS": "cpu"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
+            stderr=self._said,
         )
         os.setpriority(os.PRIO_PROCESS, self._child.pid, 19)
 
@@ -82,13 +89,19 @@ class Films(Logger):
         """Tells of the film that was being made, if it ends within `wait` seconds."""
         if self._child is None:
             return
-        try:
-            _, said = self._child.communicate(timeout=wait)
-        except subprocess.TimeoutExpired:
+        if wait and self._child.poll() is None:
+            self._message(f"waiting {wait:.0f} s at most for a film")
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._child.wait(wait)
+        code = self._child.poll()
+        if code is None:
             return
-        code, self._child = self._child.returncode, None
+        self._child = None
+        with self._said as file:
+            file.seek(0)
+            said = file.read().decode(errors="replace").strip().splitlines()
         if code:
-            last = (said.strip().splitlines() or [f"exit code {code}"])[-1]
+            last = (said or [f"exit code {code}"])[-1]
             self._message(f"no film of iteration {int(self._row['iteration']) + 1}: {last}")
             return
         for video in sorted(self._out.glob("*.mp4")):
@@ -98,3 +111,9 @@ class Films(Logger):
     def _message(self, text: str) -> None:
         for logger in self._told:
             logger.message(text)
+
+
+def sheets_of(run_dir: Path) -> list[tuple[int, Path]]:
+    """(env steps, contact sheet) of the films that training has left in a run, oldest first."""
+    sheets = (run_dir / FOLDER).glob("*/*.png")
+    return sorted((int(s.parent.name), s) for s in sheets if s.parent.name.isdigit())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from typing import Any
 import jax
 
 from cmrl_jax.algorithms.base import RunState
-from cmrl_jax.config.schema import Config, ConfigError, lanes_per_task
+from cmrl_jax.config.schema import Config, ConfigError
 from cmrl_jax.evaluation.session import Session
 from cmrl_jax.registry import rules_of
 from cmrl_jax.storage.checkpoint import join_run, split_run
@@ -19,11 +20,6 @@ from cmrl_jax.storage.versions import package_versions, write_versions
 from cmrl_jax.text.goals import check_same_table
 from cmrl_jax.training.logger import Logger, Progress, RunInfo
 from cmrl_jax.training.metrics import MetricsCsv
-
-
-def steps_of(config: Config) -> int:
-    """Control steps of an iteration."""
-    return config.collect.lanes * config.env.horizon
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,16 +51,19 @@ class Run:
         self.full, self.policy = stores
         self.session, self.algorithm = session, session.algorithm
         self.csv: MetricsCsv | None = None
+        self.rules = rules_of(config)
+        self.steps = self.rules.steps_per_iteration()
 
     def say(self, text: str) -> None:
         for logger in self.loggers:
             logger.message(self.label + text)
 
     def close(self) -> None:
-        if self.csv is not None:
-            self.csv.close()
-        for logger in self.loggers:
-            logger.close()
+        with contextlib.ExitStack() as left:  # one that cannot be closed keeps no other open
+            for logger in reversed(self.loggers):
+                left.callback(logger.close)
+            if self.csv is not None:
+                left.callback(self.csv.close)
 
     def saved(self, one: RunState, newest: int | None = None) -> Saved | None:
         """The newest sound checkpoint, or that of iteration `newest`; None before the first save.
@@ -136,15 +135,15 @@ class Run:
             )
             raise ConfigError(
                 f"{self.label}iteration {iteration}: {share} non-finite",
-                f"{rules_of(config).on_bad_gradients}; {kept}",
+                f"{self.rules.on_bad_gradients}; {kept}",
             )
         # As many as a whole task collects: what is learned from is no longer the task.
-        if faults >= lanes_per_task(config) * config.env.horizon or (faults and is_strict):
+        if faults >= self.steps // len(config.tasks.train) or (faults and is_strict):
             other = "native" if config.env.physics == "mjx" else "mjx"
             simulator = f"with env.physics: {other}, or " if config.env.name == "ml4" else ""
             raise ConfigError(
                 f"{self.label}iteration {iteration}: the physics of {faults} of "
-                f"{steps_of(config)} control steps was non-finite",
+                f"{self.steps} control steps was non-finite",
                 f"start a new run {simulator}without the last change; {kept}",
             )
         if skipped:
@@ -158,7 +157,7 @@ class Run:
         meta = {
             "config": dataclasses.asdict(self.config),
             "iteration": done,
-            "env_steps": done * steps_of(self.config),
+            "env_steps": done * self.steps,
             "wall_s": wall,
             "csv_offset": self.csv.offset,
             "versions": package_versions(),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cmrl_jax.config.extras import require_extra
-from cmrl_jax.training.films import FOLDER
+from cmrl_jax.training.films import sheets_of
 from cmrl_jax.training.logger import Logger, Progress, RunInfo
 from cmrl_jax.training.metrics import Row, figures_of
 
@@ -48,10 +48,13 @@ class TensorBoard(Logger):
         # One that looks on drops what it has read of the files before.
         start = self._session_log(status=self._session_log.START)
         self._add(self._event(session_log=start, wall_time=self._begun))
+        last = 0
         for row in run.rows:
             self._add_row(row)
-        for sheet in sorted((run.run_dir / FOLDER).glob("*/*.png")):
-            self._add_picture(f"film/{sheet.stem}", int(sheet.parent.name), sheet)
+            last = int(row["env_steps"])
+        for steps, sheet in sheets_of(run.run_dir):
+            if steps <= last:
+                self._add_picture(f"film/{sheet.stem}", steps, sheet)
         self._flush()
         for path in before:
             os.truncate(path, 0)  # a TensorBoard that looks on would not go past one that is gone

@@ -30,7 +30,7 @@ from cmrl_jax.storage.checkpoint import full_store, policy_store
 from cmrl_jax.storage.run_dir import write_text
 from cmrl_jax.training.logger import Logger, Progress
 from cmrl_jax.training.metrics import LEADING_COLUMNS, metric_names, metric_row
-from cmrl_jax.training.run import Run, steps_of
+from cmrl_jax.training.run import Run
 
 EVAL_FIGURES = ("success_any", "success_last", "return")
 
@@ -48,7 +48,7 @@ class Schedule:
 
     @classmethod
     def of(cls, config: Config) -> Schedule:
-        steps = steps_of(config)
+        steps = rules_of(config).steps_per_iteration()
         total = math.ceil(config.train.env_steps / steps) if config.train.env_steps else None
         tasks = len(config.tasks.train) + len(config.tasks.test)
         episodes = max(config.eval.k) + 1
@@ -167,8 +167,9 @@ class _Training:
         try:
             return self.train(device, resume)
         finally:
-            for run in self.runs:
-                run.close()
+            with contextlib.ExitStack() as left:
+                for run in reversed(self.runs):
+                    left.callback(run.close)
 
     def train(self, device: str, resume: bool) -> list[Outcome]:
         self.say(f"device: {device}")

@@ -6,8 +6,9 @@ environment, reset with seed s, is the single environment reset with seed s + i,
 own SyncVectorEnv. Goals are drawn from NumPy's generators, as Gymnasium asks, not from keys of jax.
 
 A goal is the fixture's placement (3,) in metres. `reset` tells it as `info["goal"]`, and takes one
-in `options={"goal": ...}`. A step's info has `success` (at this very step) and `distance` (metres,
-what success is judged by). No episode terminates; it is truncated after `horizon` control steps.
+in `options={"goal": ...}`. A step's info has `success` (at this very step), `distance` (metres,
+what success is judged by) and `faults` (times the episode's simulation failed and was put back to
+its start). No episode terminates; it is truncated after `horizon` control steps.
 """
 
 from __future__ import annotations
@@ -90,13 +91,17 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Raises:
             gymnasium.error.ResetNeeded: there is no episode yet.
-            ValueError: an action of another shape (two lines: cause, cure).
+            ValueError: an action of another shape, or not finite (two lines: cause, cure).
         """
         if self._goal is None:
             raise _reset_needed()
         actions = _as_actions(action, (ACTION_SIZE,))[None]
         moment = self._lanes.step(actions, np.zeros(1, bool), self._goal[None])
-        info = {"success": bool(moment.success[0]), "distance": float(moment.distance[0])}
+        info = {
+            "success": bool(moment.success[0]),
+            "distance": float(moment.distance[0]),
+            "faults": int(moment.faults[0]),
+        }
         is_over = bool(moment.steps[0] >= self.horizon)
         return moment.obs[0], float(moment.reward[0]), False, is_over, info
 
@@ -215,7 +220,7 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Raises:
             gymnasium.error.ResetNeeded: there are no episodes yet.
-            ValueError: actions of another shape (two lines: cause, cure).
+            ValueError: actions of another shape, or not finite (two lines: cause, cure).
         """
         if self._goals is None:
             raise _reset_needed()
@@ -224,7 +229,12 @@ class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._goals = self._drawn(self._goals, is_fresh)
         moment = self._lanes.step(actions, is_fresh, self._goals)
         infos = _masked({"goal": self._goals}, is_fresh)
-        infos |= _masked({"success": moment.success, "distance": moment.distance}, ~is_fresh)
+        found = {
+            "success": moment.success,
+            "distance": moment.distance,
+            "faults": moment.faults,
+        }
+        infos |= _masked(found, ~is_fresh)
         self._is_due = moment.steps >= self.horizon
         is_terminated = np.zeros(self.num_envs, bool)
         return moment.obs, moment.reward, is_terminated, self._is_due.copy(), infos
@@ -324,6 +334,8 @@ def _as_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
     actions = np.asarray(actions, np.float32)
     if actions.shape != shape:
         raise ValueError(f"an action of shape {actions.shape}\ngive one of shape {shape}")
+    if not np.isfinite(actions).all():
+        raise ValueError("an action is NaN or infinite\ngive numbers, of which [-1, 1] counts")
     return actions
 
 

@@ -30,6 +30,7 @@ class Moment(NamedTuple):
     success: np.ndarray  # (lane,) bool, at this very step
     distance: np.ndarray  # (lane,) float64, metres between object and target
     steps: np.ndarray  # (lane,) int32, control steps since the reset
+    faults: np.ndarray  # (lane,) int32, times the simulation failed and was put back to the start
 
 
 class TaskLanes:
@@ -109,8 +110,8 @@ def _merge(is_new: jax.Array, new: Any, old: Any) -> Any:
 
 
 def _read(states: Any) -> Moment:
-    read = states.obs, states.reward, states.success, states.distance, states.steps
-    obs, reward, success, distance, steps = jax.device_get(read)
+    read = states.obs, states.reward, states.success, states.distance, states.steps, states.faults
+    obs, reward, success, distance, steps, faults = jax.device_get(read)
     # Copies: what jax hands out may be its own memory, and not to be written to.
     return Moment(
         obs=np.array(obs),
@@ -118,4 +119,5 @@ def _read(states: Any) -> Moment:
         success=np.array(success),
         distance=distance.astype(np.float64),
         steps=np.array(steps),
+        faults=np.array(faults),
     )

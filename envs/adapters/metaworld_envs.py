@@ -55,6 +55,7 @@ def make_vector_env(
     horizon: int,
     goal_observable: bool = False,
     seed: int = 0,
+    with_last_step: bool = False,
 ) -> SyncVectorEnv:
     """Environments that share a task's goals evenly, with Meta-World's wrappers of a test set.
 
@@ -64,6 +65,8 @@ def make_vector_env(
     Args:
         placements: goals (goal, 3), as many as a multiple of `environments`.
         horizon: control steps of an episode, at most `MAX_HORIZON`.
+        with_last_step: whether observations go on with the last action (4,), the last reward and
+            whether it ended an episode, as Meta-World shows them to recurrent agents.
     """
     return metaworld._make_ml_envs_inner(  # pyright: ignore[reportReturnType]
         OneClass(task, placements, goal_observable),
@@ -73,6 +76,8 @@ def make_vector_env(
         task_select="pseudorandom",
         terminate_on_success=True,
         max_episode_steps=horizon,
+        recurrent_info_in_obs=with_last_step,
+        normalize_reward_in_recurrent_info=False,
     )
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from envs.engine import load_gl
 from envs.render.frames import Renderer, camera_of, choose_gl, metaworld_scene, place
 
 SIZE = 480  # pixels, as Meta-World's own
+
+
+_choose_gl = functools.cache(choose_gl)  # it asks a process of its own, once for all environments
 
 
 class LivePictures:
@@ -19,7 +24,7 @@ class LivePictures:
 
     def __init__(self, task: str):
         # MuJoCo has been imported by now, maybe before anybody asked for pictures.
-        choose_gl()
+        _choose_gl()
         load_gl()
         self._task = task
         self._model = metaworld_scene(task, np.zeros(3))

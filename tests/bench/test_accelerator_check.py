@@ -3,6 +3,7 @@
 import json
 import math
 
+import jax
 import pytest
 
 from cmrl_jax.config.schema import ConfigError
@@ -89,3 +90,13 @@ def test_a_file_of_another_command_stays(tmp_path):
     with pytest.raises(ConfigError, match="this command did not write it"):
         main(["--toy", "--json", str(path)])
     assert path.read_text() == "mine"
+
+
+def test_every_part_computes_as_a_run_does(monkeypatch):
+    """In full precision, also where no run is built that would ask for it."""
+    seen = []
+    note = lambda size, began: seen.append(jax.config.jax_default_matmul_precision)
+    monkeypatch.setitem(PARTS, "mjx", (note, 60))
+    with jax.default_matmul_precision("default"):
+        main(["--toy", "--part", "mjx"])
+        assert seen == ["highest"]

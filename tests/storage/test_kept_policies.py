@@ -6,12 +6,14 @@ from pathlib import Path
 import pytest
 
 from cmrl_jax.cli.evaluate_flags import find_runs
+from cmrl_jax.cli.plot_flags import check_inspectable
+from cmrl_jax.cli.train import run_train
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.storage.kept_policies import kept_policies
 from cmrl_jax.storage.manifest import find_damage
 from cmrl_jax.storage.packed import packed_steps, unpack
-from cmrl_jax.storage.run_dir import find_run
+from cmrl_jax.storage.run_dir import find_run, place_beside
 
 NAME = "cmrl-window-close-s0"
 
@@ -45,3 +47,19 @@ def test_each_is_whole_and_can_be_acted_by(name):
         place = Path(folder) / str(step)
         unpack(packed, place)
         assert find_damage(place) is None
+
+
+def test_nothing_is_written_into_one(tmp_path, monkeypatch):
+    """By name or by path: it is not gone on with, and what is made of it goes elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    kept = kept_policies()[NAME]
+    before = {path: path.stat().st_mtime_ns for path in kept.rglob("*")}
+    for run in (NAME, str(kept)):
+        with pytest.raises(ConfigError, match="comes with the project") as raised:
+            run_train(["--run", run, "--resume"])
+        assert "--config ml4.yaml" in raised.value.cure
+        assert place_beside(find_run(Path(run))) == Path("runs") / NAME
+    with pytest.raises(ConfigError, match="comes with the project"):
+        check_inspectable(Path(NAME))
+    assert place_beside(tmp_path) == tmp_path
+    assert before == {path: path.stat().st_mtime_ns for path in kept.rglob("*")}

@@ -102,59 +102,76 @@ def test_films_are_of_meta_world_alone(monkeypatch):
         load_config("smoke", {"log.video_every": 1, "env.name": "other"})
 
 
-class Process:
-    """A film that is made when the test says so."""
-
-    begun: list[list[str]] = []
-
-    def __init__(self, words, **_):
-        self.words, self.pid, self.returncode = words, 0, None
-        Process.begun.append(words)
-
-    def communicate(self, timeout):
-        if self.returncode is None:
-            raise films.subprocess.TimeoutExpired("render", timeout)
-        return "", "first\nthe last line"
-
-    def kill(self):
-        self.returncode = -9
-
-    def wait(self):
-        pass
+# Stands in for `render`: ends when it is told its exit code, with more to say than a pipe holds.
+FILMING = """
+import pathlib, sys, time
+out = pathlib.Path(sys.argv[sys.argv.index("--out") + 1])
+told = out.parent.parent / "exit"
+while not told.exists():
+    time.sleep(0.01)
+sys.stderr.write("x" * 200_000 + "\\nthe last line\\n")
+out.mkdir(parents=True)
+(out / "window-open.mp4").write_bytes(b"film")
+sys.exit(int(told.read_text()))
+"""
 
 
 @pytest.fixture
 def stage(tmp_path, monkeypatch):
-    """Films over a stand-in for processes, the loggers that it tells, and its run directory."""
-    Process.begun = []
-    monkeypatch.setattr(films.subprocess, "Popen", Process)
-    monkeypatch.setattr(films.os, "setpriority", lambda *_: None)
+    """Films by a short process, the logger that it tells, and its run directory."""
+    monkeypatch.setattr(films, "CHILD", FILMING)
     told = Told()
     sink = Films([told])
     sink.start(RunInfo(tmp_path, FILMED))
     for iteration in (2, 4, 6):
         (tmp_path / "policy" / str(iteration)).mkdir(parents=True)
-    return sink, told, tmp_path
+    yield sink, told, tmp_path
+    sink.close()
+
+
+def ended(sink, run, code):
+    """Lets the film end that is being made."""
+    part = run / "exit.part"
+    part.write_text(str(code))
+    part.rename(run / "exit")
+    sink._child.wait(30)
 
 
 def test_the_loop_never_waits_for_a_film(stage):
     sink, told, run = stage
-    for iteration in range(5):  # policies 2 and 4 are due
+    for iteration in range(5):  # policies 2 and 4 are due, and 2 is not there before the end
         sink.row(make_row(iteration), HALF)
-    assert len(Process.begun) == 1 and Process.begun[0][-3:-1] == ["2", "--out"]
-    (run / "films" / "10").mkdir(parents=True)
-    (run / "films" / "10" / "window-open.mp4").write_bytes(b"film")
-    sink._child.returncode = 0
+    assert not told.films
+    ended(sink, run, 0)
     sink.row(make_row(5), HALF)
     assert told.films == [("window-open", 1, b"film")]
+    sink.row(make_row(6), HALF)  # policy 6
+    sink._child.wait(30)
+    sink.row(make_row(7), HALF)
+    assert told.films == [("window-open", iteration, b"film") for iteration in (1, 5)]
+
+
+def test_a_run_waits_for_its_last_film_at_its_end_alone(stage):
+    sink, told, run = stage
+    for iteration in range(3):
+        sink.row(make_row(iteration), HALF)
+    sink.close()  # stopped
+    assert not told.films and sink._child.returncode < 0
+    sink = Films([told])
+    sink.start(RunInfo(run, FILMED))
+    (run / "exit").write_text("0")
+    for iteration in range(4):
+        sink.row(make_row(iteration), Progress((iteration + 1) / 4, 0.0))
     sink.close()
+    assert [iteration for _, iteration, _ in told.films][-1] == 3
+    assert "waiting 120 s at most for a film" in told.messages
 
 
 def test_a_film_that_fails_is_a_message(stage):
-    sink, told, _ = stage
+    sink, told, run = stage
     for iteration in range(3):
         sink.row(make_row(iteration), HALF)
-    sink._child.returncode = 2
+    ended(sink, run, 2)
     sink.row(make_row(3), HALF)
     assert told.messages == ["no film of iteration 2: the last line"] and not told.films
 
@@ -164,7 +181,11 @@ def test_a_policy_that_was_not_saved_is_not_filmed(stage):
     (run / "policy" / "2").rmdir()
     for iteration in range(3):
         sink.row(make_row(iteration), HALF)
-    assert not Process.begun
+    assert sink._child is None
+
+
+def test_what_was_never_started_can_be_closed():
+    Films([]).close()
 
 
 def test_tensorboard_shows_sheets_also_after_a_resume(tmp_path):
@@ -172,12 +193,15 @@ def test_tensorboard_shows_sheets_also_after_a_resume(tmp_path):
     image = pytest.importorskip("PIL.Image")
     folder = tmp_path / "films" / "20"
     folder.mkdir(parents=True)
-    image.new("RGB", (8, 4)).save(folder / "window-open.png")
+    for place in ("20", "30", "best"):  # 30 is after the checkpoint, best is the user's own
+        (tmp_path / "films" / place).mkdir(exist_ok=True)
+        image.new("RGB", (8, 4)).save(tmp_path / "films" / place / "window-open.png")
     for _ in range(2):
         board = TensorBoard()
-        board.start(RunInfo(tmp_path, Config()))
+        board.start(RunInfo(tmp_path, Config(), [make_row(1), make_row(2)]))
         board.close()
-        assert tensorboard_points(tmp_path / "tensorboard") == [(20, "film/window-open", 0.0)]
+        shown = tensorboard_points(tmp_path / "tensorboard")
+        assert [p for p in shown if p[1].startswith("film/")] == [(20, "film/window-open", 0.0)]
 
 
 @pytest.mark.slow

@@ -27,6 +27,8 @@ from cmrl_jax.algorithms.common.rollout import (
     StepStats,
     correlated_noise,
     episode_figures,
+    keys_of,
+    make_reset,
     rollout,
 )
 from cmrl_jax.config.schema import Config, lanes_per_task
@@ -78,13 +80,12 @@ class TrainIteration:
     ):
         self.__name__ = "train_iteration"  # as profilers and compilation logs show it
         self.config, self.env, self.learner = config, env, learner
-        self.goal_vectors, self.goals = goal_vectors, goals
+        self.goal_vectors = goal_vectors
         self.freeze_statistics, self.learn_at_once = freeze_statistics, learn_at_once
         self.num_tasks, self.per_task = len(config.tasks.train), lanes_per_task(config)
         self.lanes = self.num_tasks * self.per_task
-        ids = jnp.array([env.tasks.index(name) for name in config.tasks.train])
-        self.env_task = jnp.repeat(ids, self.per_task)
         self.train_task = jnp.repeat(jnp.arange(self.num_tasks), self.per_task)  # row of the rings
+        self.reset = make_reset(config, env, goals, self.train_task)
         # (lane,) index of LANE_GROUPS.
         self.source = np.tile(np.repeat(np.arange(3), lane_groups(config)), self.num_tasks)
         self.noise_scale = make_noise_scale(config)
@@ -188,13 +189,7 @@ class TrainIteration:
 
     def reset_lanes(self, key: jax.Array) -> Any:
         """A fresh episode of every lane, each by a key of its own."""
-        lane_key = jax.vmap(lambda lane: jax.random.fold_in(key, lane))(jnp.arange(self.lanes))
-        if self.goals is None:
-            return parallel.by_part(jax.vmap(self.env.reset))(lane_key, self.env_task)
-        count = self.goals.shape[1]
-        goal = jax.vmap(lambda k: jax.random.randint(k, (), 0, count))(lane_key)
-        chosen = self.goals[self.train_task, goal]
-        return parallel.by_part(jax.vmap(self.env.reset_to))(self.env_task, chosen)
+        return self.reset(keys_of(key, self.lanes))
 
     def _train_steps(self, run: RunState, key: jax.Array) -> tuple[RunState, dict[str, jax.Array]]:
         """The chunk's gradient steps; metrics are their means."""

@@ -6,7 +6,6 @@ PEARL, MTSAC and SAC are configurations of CMRL: `model.conditioning` is z, task
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from cmrl_jax.algorithms.rules import AlgorithmRules
 from cmrl_jax.config.schema import LARGEST_RING, Config, lanes_per_task, require
@@ -59,13 +58,8 @@ class Rules(AlgorithmRules):
         if self.adapts:
             self.kind = f"encoder.goal_fusion {fusion}"
 
+    seed_and_length_shape = False
     on_bad_gradients = "start a new run with a lower sac.lr"
-
-    def shaping(self) -> Config:
-        """Beside what no algorithm's programs depend on: the seed, and how long a run is."""
-        config, usual = super().shaping(), Config()
-        length = replace(config.train, env_steps=usual.train.env_steps, minutes=usual.train.minutes)
-        return replace(config, seed=usual.seed, train=length)
 
     def check(self) -> None:
         """Raises ConfigError for the first combination that cannot be trained."""

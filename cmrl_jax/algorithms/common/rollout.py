@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from cmrl_jax import parallel
 from cmrl_jax.algorithms.common.replay import Transition
+from cmrl_jax.config.schema import Config
 from envs.base import MetaEnv
 
 Act = Callable[[jax.Array, jax.Array, jax.Array | None], jax.Array]
@@ -82,6 +83,32 @@ def rollout(
     inputs = (begun + jnp.arange(steps), jax.random.split(key, steps), noise, imposed)
     state, (transitions, stats) = jax.lax.scan(step, state, inputs)
     return state, transitions, stats
+
+
+def keys_of(key: jax.Array, count: int) -> jax.Array:
+    """Keys (count,), each its own number's, however many there are."""
+    return jax.vmap(lambda number: jax.random.fold_in(key, number))(jnp.arange(count))
+
+
+def make_reset(
+    config: Config, env: MetaEnv, goals: jax.Array | None, train_task: jax.Array
+) -> Callable[[jax.Array], Any]:
+    """Keys (lane,) -> fresh episodes of all lanes; equal keys of a task have equal goals.
+
+    Args:
+        goals: goals (training task, goal, goal_size) to draw from; None: the environment's resets.
+        train_task: (lane,) rows of the training tasks.
+    """
+    ids = jnp.array([env.tasks.index(name) for name in config.tasks.train])[train_task]
+
+    def reset(keys: jax.Array) -> Any:
+        if goals is None:
+            return parallel.by_part(jax.vmap(env.reset))(keys, ids)
+        count = goals.shape[1]
+        goal = jax.vmap(lambda k: jax.random.randint(k, (), 0, count))(keys)
+        return parallel.by_part(jax.vmap(env.reset_to))(ids, goals[train_task, goal])
+
+    return reset
 
 
 def select_lanes(chosen: jax.Array, new: Any, old: Any) -> Any:

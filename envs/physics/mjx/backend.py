@@ -7,6 +7,7 @@ tendons, sensors, its collision driver) are skipped.
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,13 @@ from flax import struct
 from envs.physics.base import Positions, settled_starts
 from envs.physics.mjx import rotations
 from envs.physics.mjx.contact import Contacts, find_contacts
-from envs.physics.mjx.geometry import FixtureShapes, load_gripper, load_shapes
+from envs.physics.mjx.geometry import (
+    LEFT,
+    RIGHT,
+    FixtureShapes,
+    load_gripper,
+    load_shapes,
+)
 from envs.physics.mjx.kinematics import Kinematics
 from envs.physics.mjx.quiet import mjx
 from envs.physics.mjx.solver import (
@@ -151,10 +158,15 @@ class MjxPhysics:
         """
         scene = self.scene(scene_id)
         body = lambda s, _: (self._substep(s, ctrl, scene), None)
-        return jax.lax.scan(body, state, None, length=SUBSTEPS)[0]
+        with exact_products():
+            return jax.lax.scan(body, state, None, length=SUBSTEPS)[0]
 
     def positions(self, state: PhysicsState, scene_id: jax.Array) -> Positions:
         """Positions after kinematics, as Meta-World reads them after `mj_forward`."""
+        with exact_products():
+            return self._positions(state, scene_id)
+
+    def _positions(self, state: PhysicsState, scene_id: jax.Array) -> Positions:
         scene = self.scene(scene_id)
         data = self._data.replace(qpos=state.qpos[:ROBOT_JOINTS])
         data = self._kinematics(data)
@@ -314,7 +326,7 @@ class MjxPhysics:
     ) -> Cones:
         count = contacts.dist.shape[0]
         translate, rotate = jax.vmap(lambda p: self._robot_jacobian(data, p))(contacts.pos)
-        fingers = jnp.stack([contacts.part == 1, contacts.part == 2], 1)  # (contact, 2)
+        fingers = jnp.stack([contacts.part == RIGHT, contacts.part == LEFT], 1)  # (contact, 2)
         mask = jnp.concatenate([jnp.ones((count, ARM_JOINTS)), fingers], 1)
         axes = data.xaxis[ARM_JOINTS:]  # finger slides move a finger's points, but do not turn them
         translate = translate.at[:, ARM_JOINTS:].set(axes) * mask[..., None]
@@ -360,6 +372,11 @@ class MjxPhysics:
         rotate = jnp.zeros((ROBOT_JOINTS, 3)).at[arm].set(data.xaxis[arm])
         translate = jnp.cross(rotate, point - data.xanchor)
         return translate, rotate
+
+
+def exact_products() -> contextlib.AbstractContextManager[Any]:
+    """Products in float32, whoever calls: TF32, an accelerator's default, harms contacts."""
+    return jax.default_matmul_precision("highest")
 
 
 def _fence(tree: Any) -> Any:

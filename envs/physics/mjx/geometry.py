@@ -91,6 +91,9 @@ class FixtureShapes(NamedTuple):
 
 
 def _material(model: mujoco.MjModel, geoms: list[int]) -> Material:
+    # What solver.py takes for granted, as it holds for all of Meta-World's scenes.
+    if (model.geom_solimp[geoms][:, 4] != 2).any() or (model.geom_solref[geoms] <= 0).any():
+        raise ValueError("every geom needs power 2 in solimp, and a positive solref")
     return Material(
         friction=model.geom_friction[geoms][:, :2].copy(),
         solref=model.geom_solref[geoms].copy(),

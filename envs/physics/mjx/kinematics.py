@@ -13,18 +13,24 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.engine import mujoco
 from envs.physics.mjx import rotations
 from envs.physics.mjx.rotations import Parts
+
+Joint = mujoco.mjtJoint
 
 
 class Kinematics:
     """The chain of a model, as `arm_model` makes it: hinges and slides, one a body."""
 
     def __init__(self, model: mujoco.MjModel):
-        if model.njnt != model.nbody - 1 or model.jnt_pos.any() or model.qpos0.any():
+        one_each = (model.body_jntnum[1:] == 1).all()
+        if not one_each or model.jnt_pos.any() or model.qpos0.any():
             raise ValueError("every body needs one joint, in its origin and zero at rest")
+        if not np.isin(model.jnt_type, (Joint.mjJNT_HINGE, Joint.mjJNT_SLIDE)).all():
+            raise ValueError("every joint must be a hinge or a slide")
         self._model = model
         self._com_pos = jnp.asarray(model.body_ipos, jnp.float32)
         self._com_quat = jnp.asarray(model.body_iquat, jnp.float32)
@@ -43,7 +49,7 @@ class Kinematics:
             origin = [a + b for a, b in zip(pos[parent], offset, strict=True)]
             turned = rotations.product(quat[parent], model.body_quat[body].tolist())
             anchors.append(origin)
-            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+            if model.jnt_type[joint] == Joint.mjJNT_HINGE:
                 half = 0.5 * qpos[joint]
                 sine = jnp.sin(half)
                 turned = rotations.product(turned, [jnp.cos(half), *(a * sine for a in axis)])
