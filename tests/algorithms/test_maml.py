@@ -171,7 +171,8 @@ def test_an_episode_that_ends_early_ends_there(agent, params):
     mask = (jnp.arange(STEPS) < 3)[None].astype(jnp.float32)
     memory = agent.observe(saved, memory, shown(found, 0), mask)
     assert memory.steps[0].tolist() == [3, 0]
-    np.testing.assert_allclose(memory.reward[0, 0], [*found.reward[0, :3], 0, 0], rtol=1e-6)
+    wanted = np.append(found.reward[0, :3], [0, 0])
+    np.testing.assert_allclose(memory.reward[0, 0], wanted, rtol=1e-6)
     longer = jax.tree.map(lambda x: jnp.tile(x, (1, 2) + (1,) * (x.ndim - 2)), shown(found, 1))
     after = agent.observe(saved, memory, longer, jnp.ones((1, 2 * STEPS)))
     assert np.isfinite(after.reward).all()  # an episode longer than those of the run

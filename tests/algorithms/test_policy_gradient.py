@@ -1,5 +1,7 @@
 """What policy-gradient methods share, against plain loops and by hand."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,8 @@ def test_advantages_are_the_sum_of_discounted_errors():
     reward, value = generator.normal(size=(2, time, lanes))
     last_value = generator.normal(size=lanes)
     mask = generator.random((time, lanes)) < 0.7
-    found = gae(*map(jnp.asarray, (reward, value, last_value, mask)), GAMMA, LAMBDA)
+    arrays: Any = map(jnp.asarray, (reward, value, last_value, mask))
+    found = gae(*arrays, gamma=GAMMA, gae_lambda=LAMBDA)
     wanted = np.zeros((time, lanes))
     for lane in range(lanes):
         steps = np.flatnonzero(mask[:, lane])

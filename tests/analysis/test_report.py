@@ -14,7 +14,7 @@ from cmrl_jax.cli.main import main
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.presets import preset_of
 from cmrl_jax.config.schema import ConfigError
-from cmrl_jax.evaluation.statistics import wilson_interval
+from cmrl_jax.evaluation.statistics import seeds_band, wilson_interval
 
 
 def page_of(runs, tmp_path, files=()):
@@ -82,9 +82,9 @@ def test_what_was_run_is_the_preset_and_its_flags(tmp_path):
     assert "python train.py --config smoke.yaml --seed 3 --sac.batch 16" in page
 
 
-@pytest.mark.parametrize("name", ["ml4.yaml", "ml4-plain.yaml", "pearl.yaml", "sac.yaml"])
+@pytest.mark.parametrize("name", ["ml4", "ml4-plain", "pearl", "sac", "rl2", "maml"])
 def test_a_packaged_configuration_is_its_own_preset(name):
-    assert preset_of(load_config(name)) == (name, {})
+    assert preset_of(load_config(name)) == (f"{name}.yaml", {})
 
 
 def test_files_of_eval_and_finetune_are_added(run, tmp_path):
@@ -135,3 +135,52 @@ def test_a_damaged_file_is_named(run, tmp_path):
     (tmp_path / "x.json").write_text("{}")
     with pytest.raises(ConfigError, match="x.json"):
         write_report([run], [tmp_path / "x.json"], tmp_path / "page.html")
+
+
+def test_several_seeds_have_the_interval_of_the_band(tmp_path):
+    runs = [
+        write_run(tmp_path / f"x-seed{n}", by_k={0: 0.1 * n}, flags={"seed": n, "eval.k": "0"})
+        for n in range(4)
+    ]
+    page = page_of(runs, tmp_path)
+    _, low, high = seeds_band(np.array([[0.0], [0.1], [0.2], [0.3]]))
+    assert f"{low[0]:.2f} to {high[0]:.2f} (4 seeds)" in page
+
+
+def test_files_of_one_name_both_stand_there(run, tmp_path):
+    files = []
+    for place, rate in (("old", 0.25), ("new", 0.75)):
+        path = tmp_path / place / "run" / "search-task.json"
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps(evaluation({20: rate}, adapt="search")))
+        files.append(path)
+    page = page_of([run], tmp_path, files)
+    shown = [t["y"] for _, traces in figures_in(page) for t in traces if t.get("x") == [20]]
+    assert sorted(shown) == [[0.25], [0.75]]
+
+
+def test_the_command_of_an_evaluation_is_that_which_made_it(run, tmp_path):
+    found = evaluation({0: 0.5}, goals=50, seed=7, adapt="search", protocol="task", draws=3)
+    (run / "eval.json").write_text(json.dumps(found))
+    page = page_of([run], tmp_path)
+    (line,) = [line for line in page.splitlines() if "train.py eval" in line]
+    for flag in ("--seed 7", "--adapt search", "--protocol task", "--eval-seeds 3"):
+        assert flag in line
+    assert "--z" not in line
+
+
+def test_films_of_training_are_in_the_page_too(run, tmp_path):
+    for steps in (900, 1000):
+        folder = run / "films" / str(steps)
+        folder.mkdir(parents=True)
+        (folder / "window-open.png").write_bytes(str(steps).encode())
+    page = page_of([run], tmp_path)
+    newest, older = (base64.b64encode(x).decode() for x in (b"1000", b"900"))
+    assert newest in page and older not in page and "1,000 steps, window-open" in page
+
+
+def test_the_users_own_configurations_are_no_presets(tmp_path, monkeypatch):
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "foo.yaml").write_text("model:\n  hidden: 3\n")
+    monkeypatch.chdir(tmp_path)
+    assert preset_of(load_config("smoke")) == ("smoke.yaml", {})

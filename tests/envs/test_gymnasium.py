@@ -232,6 +232,8 @@ def test_values_that_there_are_not(make, cause, cure):
         (lambda env: env.reset(options={"reset_mask": np.zeros(3, bool)}), "no lanes", "True"),
         (lambda env: env.reset(seed=[1, 2]), "2 seeds for 3 lanes", "one a lane"),
         (lambda env: env.step(np.zeros(4)), "an action of shape (4,)", "shape (3, 4)"),
+        (lambda env: env.step(np.full((3, 4), np.nan)), "an action is NaN", "give numbers"),
+        (lambda env: env.step(np.full((3, 4), np.inf)), "an action is NaN or infinite", "numbers"),
     ],
 )
 def test_mistakes_of_a_call(call, cause, cure):

@@ -1,6 +1,10 @@
 """The arm against MuJoCo: poses, mass matrix and forces, and what the chain must be like."""
 
+import re
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -32,11 +36,28 @@ def test_poses_are_mujocos(arm):
 
 
 def test_another_kind_of_chain_is_refused():
-    joints = '<joint axis="1 0 0"/><joint axis="0 1 0"/>'
-    body = f'<body>{joints}<geom size="1"/></body>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    with pytest.raises(ValueError, match="one joint"):
-        Kinematics(model)
+    one, geom = '<joint axis="1 0 0"/>', '<geom size="1"/>'
+    two = f'{one}<joint axis="0 1 0"/>{geom}'
+    for body, cause in (
+        (two, "one joint"),
+        (f"{two}<body>{geom}</body>", "one joint"),  # as many joints as bodies
+        (f'<joint type="ball"/>{geom}', "a hinge or a slide"),
+    ):
+        xml = f"<mujoco><worldbody><body>{body}</body></worldbody></mujoco>"
+        with pytest.raises(ValueError, match=cause):
+            Kinematics(mujoco.MjModel.from_xml_string(xml))
+
+
+def test_products_are_exact_whoever_calls():
+    """TF32, an accelerator's default, harms contacts: no product is left to a caller's setting."""
+    physics = MjxPhysics()
+    task: Any = jnp.asarray(0)
+    with jax.default_matmul_precision("default"):
+        state = physics.start(task, jnp.zeros(3))
+        traced = jax.make_jaxpr(lambda s: physics.advance(s, jnp.zeros(4), task))(state)
+        read = jax.make_jaxpr(lambda s: physics.positions(s, task))(state)
+    found = re.findall(r"dot_general\[.*?precision=(\S+)", f"{traced}{read}", re.DOTALL)
+    assert len(found) > 10 and all("HIGHEST" in precision for precision in found)
 
 
 def test_forces_and_mass_are_mujocos(arm):

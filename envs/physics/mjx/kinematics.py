@@ -26,11 +26,11 @@ class Kinematics:
     """The chain of a model, as `arm_model` makes it: hinges and slides, one a body."""
 
     def __init__(self, model: mujoco.MjModel):
+        if not np.isin(model.jnt_type, (Joint.mjJNT_HINGE, Joint.mjJNT_SLIDE)).all():
+            raise ValueError("every joint must be a hinge or a slide")
         one_each = (model.body_jntnum[1:] == 1).all()
         if not one_each or model.jnt_pos.any() or model.qpos0.any():
             raise ValueError("every body needs one joint, in its origin and zero at rest")
-        if not np.isin(model.jnt_type, (Joint.mjJNT_HINGE, Joint.mjJNT_SLIDE)).all():
-            raise ValueError("every joint must be a hinge or a slide")
         self._model = model
         self._com_pos = jnp.asarray(model.body_ipos, jnp.float32)
         self._com_quat = jnp.asarray(model.body_iquat, jnp.float32)
