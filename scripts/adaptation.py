@@ -54,6 +54,8 @@ KINDS = {
     " --encoder.goal_fusion none --encoder.p_empty 0.0 --encoder.aux none"
     " --collect.group_frac 0.5,0.0,0.5",
     "untrained": "--config ml4.yaml --train.env_steps 19200",
+    "rl2": "--config rl2.yaml",
+    "maml": "--config maml.yaml",
 }
 _K = f"--k {','.join(map(str, K))}"
 _TASK = "--protocol task --eval-seeds 5"  # five adaptation runs, each on goals in its own order
@@ -66,16 +68,21 @@ EVALUATIONS = {  # flags of `eval`; native physics unless they say otherwise
     "text-shuffled": "--k 0 --text-control shuffled",
     "text-zero": "--k 0 --text-control zero",
     "trained": "--k 0",
+    "trained-goal": f"{_K}",
     "trained-search": "--adapt search --k 20 --protocol task --eval-seeds 3",
     # Its own function adapts for 10 episodes and counts the 3 after them.
     "metaworld": "--adapt search --physics metaworld --k 0",
+    "metaworld-own": "--physics metaworld --k 0",
 }
 _OF_PEARL = ("posterior-task", "posterior-goal", "search-task", "search-goal", "trained")
+_OF_META_RL = ("posterior-task", "posterior-goal", "trained-goal", "metaworld-own")
 OF_KIND = {
-    "cmrl": tuple(EVALUATIONS),
+    "cmrl": tuple(x for x in EVALUATIONS if x not in ("metaworld-own", "trained-goal")),
     "pearl": _OF_PEARL,
     "pearlsac": _OF_PEARL,
     "untrained": ("search-task", "search-goal"),
+    "rl2": _OF_META_RL,
+    "maml": _OF_META_RL,
 }
 FINETUNE = "finetune"  # from the winner of a search, and SAC from scratch; needs the run itself
 
@@ -104,7 +111,8 @@ def train_command(name: str) -> list[str]:
 def evaluations_of(name: str) -> list[str]:
     """What is asked of a run's policy; of Meta-World's own function in the paper's fold alone."""
     kind, fold, _ = parts(name)
-    return [x for x in OF_KIND[kind] if x != "metaworld" or fold == "window-close"]
+    of_paper = ("metaworld", "metaworld-own")
+    return [x for x in OF_KIND[kind] if x not in of_paper or fold == "window-close"]
 
 
 def score_command(name: str, evaluation: str) -> list[str]:
@@ -218,6 +226,8 @@ METHODS = {  # of (kind, adapt)
     ("pearlsac", "posterior"): "pearl-sac",
     ("pearlsac", "search"): "pearl-sac-search",
     ("untrained", "search"): "untrained-search",
+    ("rl2", "posterior"): "rl2",
+    ("maml", "posterior"): "maml",
 }
 
 
@@ -357,8 +367,8 @@ def in_metaworld(names: list[str]) -> list[str]:
     """Success that Meta-World's own `metalearning_evaluation` reports of the search."""
     lines = ["| run | Meta-World's own evaluation, after 10 episodes |", "| --- | --- |"]
     for name in names:
-        path = SCORES / name / "metaworld.json"
-        if path.exists():
+        found = [SCORES / name / f"{x}.json" for x in ("metaworld", "metaworld-own")]
+        for path in filter(Path.exists, found):
             own = read_json(path, "remove it, and score again")["metalearning_evaluation"]["tasks"]
             lines.append(f"| {name} | {own[parts(name)[1]]['mean_success_rate']:.2f} |")
     return lines
