@@ -14,6 +14,7 @@ from cmrl_jax import jax_runtime
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.jax_runtime import cache_directory, check_switches, jit_repeated
+from cmrl_jax.registry import rules_of
 from cmrl_jax.storage.run_dir import holds_run
 from cmrl_jax.training.run import Run
 from envs import goal_sets
@@ -111,7 +112,9 @@ def test_a_run_that_looks_for_nan_is_the_undisturbed_one(undisturbed, tmp_path):
 @pytest.mark.parametrize("name", ["jax_debug_nans", "jax_debug_infs"])
 def test_a_run_that_looks_for_nan_stops_at_the_first(name):
     """What is otherwise skipped or put back, with a line of warning."""
-    run = types.SimpleNamespace(config=load_config("smoke.yaml"), say=lambda line: None, label="")
+    config = load_config("smoke.yaml")
+    run = types.SimpleNamespace(config=config, say=lambda line: None, label="", steps=1000)
+    run.rules = rules_of(config)
     run.full = types.SimpleNamespace(directory="ckpt", steps=lambda: [3])
     found = {"iteration": 3, "train/skipped": 0.0, "train/physics_faults": 0.0}
     faults = ({"train/skipped": 0.02}, {"train/physics_faults": 1.0})

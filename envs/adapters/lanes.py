@@ -30,7 +30,7 @@ class Moment(NamedTuple):
     success: np.ndarray  # (lane,) bool, at this very step
     distance: np.ndarray  # (lane,) float64, metres between object and target
     steps: np.ndarray  # (lane,) int32, control steps since the reset
-    faults: np.ndarray  # (lane,) int32, times the simulation failed and was put back to the start
+    faults: np.ndarray  # (lane,) int64, times the simulation failed and was put back to the start
 
 
 class TaskLanes:
@@ -119,5 +119,5 @@ def _read(states: Any) -> Moment:
         success=np.array(success),
         distance=distance.astype(np.float64),
         steps=np.array(steps),
-        faults=np.array(faults),
+        faults=faults.astype(np.int64),
     )

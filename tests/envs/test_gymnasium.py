@@ -151,7 +151,8 @@ def test_the_step_after_the_last_begins_the_next_episode():
     actions = random_actions(HORIZON + 1, LANES)
     for number, action in enumerate(actions[:HORIZON], 1):
         _, reward, terminated, truncated, infos = env.step(action)
-        assert infos.keys() == {"success", "_success", "distance", "_distance"}
+        told = ("success", "distance", "faults")
+        assert infos.keys() == {*told, *(f"_{name}" for name in told)}
         assert infos["_success"].all() and infos["_distance"].all() and reward.all()
         assert not terminated.any() and truncated.tolist() == [number == HORIZON] * LANES
     obs, reward, _, truncated, infos = env.step(actions[HORIZON])

@@ -6,6 +6,7 @@ import math
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -237,6 +238,7 @@ class Terminal(io.StringIO):
 def test_a_progress_bar_is_drawn_on_a_terminal_only():
     def show(stream: io.StringIO, progress: bool) -> str:
         lines = console.Console(progress, stream)
+        lines.start(RunInfo(Path(), Config()))
         lines.message("a line [with] brackets")
         lines.close()
         return stream.getvalue()
@@ -245,6 +247,9 @@ def test_a_progress_bar_is_drawn_on_a_terminal_only():
     assert show(Terminal(), False) == "a line [with] brackets\n"
     drawn = show(Terminal(), True)
     assert "a line [with] brackets" in drawn and "training" in drawn
+    refused = Terminal()  # before the run begins: no bar, which nobody would end
+    console.Console(True, refused).message("refused")
+    assert refused.getvalue() == "refused\n"
 
 
 def test_versions_name_everything_a_result_depends_on(tmp_path):
