@@ -3,17 +3,26 @@
 Written in the syntax of old Pythons, so that one of them prints a cure and not a SyntaxError.
 """
 
+import os
+import shlex
 import sys
 
-CURE = "fix: run `make train`, which finds or makes the right environment\n"
+OWN = os.path.join(os.path.dirname(os.path.abspath(__file__)), ".venv", "bin", "python")
+
+
+def refuse(cause):
+    """A line of cause and one of cure: the environment of `make train`, if it is there."""
+    cure = "run `make train`, which finds or makes the right environment"
+    if os.path.exists(OWN) and not sys.executable.startswith(os.path.dirname(OWN)):
+        cure = "%s %s" % (os.path.relpath(OWN), " ".join(map(shlex.quote, sys.argv)))
+    sys.stderr.write("error: %s\nfix: %s\n" % (cause, cure))
+    return 2
 
 
 def start():
-    """Runs the command line; a Python or package that is not there is one cause and one cure."""
+    """Runs the command line, unless this Python is too old or a package is not there."""
     if sys.version_info < (3, 12):
-        sys.stderr.write("error: Python >= 3.12 is needed, this is %d.%d\n" % sys.version_info[:2])
-        sys.stderr.write(CURE)
-        return 2
+        return refuse("Python >= 3.12 is needed, this is %d.%d" % sys.version_info[:2])
     import importlib.util
 
     try:
@@ -25,9 +34,7 @@ def start():
         ours = missing in ("cmrl_jax", "envs") or missing in sys.stdlib_module_names
         if ours or importlib.util.find_spec(missing) is not None:
             raise
-        sys.stderr.write("error: the package '%s' is not installed for this Python\n" % missing)
-        sys.stderr.write(CURE)
-        return 2
+        return refuse("the package '%s' is not installed for this Python" % missing)
 
 
 if __name__ == "__main__":

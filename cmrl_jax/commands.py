@@ -14,14 +14,22 @@ CHILD = "import sys; from cmrl_jax.cli.main import main; sys.exit(main())"
 
 
 def program() -> str:
-    """How this process was started: `cmrl`, or `python train.py`."""
+    """How this process was started: `cmrl` or `python train.py`, by a path if PATH has another."""
     started = Path(sys.argv[0])
     if started.name == SCRIPT:  # a script on the PATH is handed its full name
         found = shutil.which(SCRIPT)
         on_path = found is not None and Path(found).resolve() == started.resolve()
         return SCRIPT if on_path else shlex.quote(str(started))
     script = str(started) if started.name == "train.py" else "train.py"
-    return f"python {shlex.quote(script)}"
+    return f"{_python()} {shlex.quote(script)}"
+
+
+def _python() -> str:
+    """What calls this Python: `python`, unless that is another one or none."""
+    own, found = Path(sys.executable), shutil.which("python")
+    if found is not None and Path(found).parent == own.parent:
+        return "python"
+    return shlex.quote(str(own.relative_to(Path.cwd()) if own.is_relative_to(Path.cwd()) else own))
 
 
 def command(*words: object) -> str:

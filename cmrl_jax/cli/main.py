@@ -25,16 +25,17 @@ from cmrl_jax.cli import (
     train,
 )
 from cmrl_jax.cli.flags import COMMANDS, add_force, names, parse, parser_of
+from cmrl_jax.commands import command
 from cmrl_jax.config.files import (
     run_config,
 )
-from cmrl_jax.config.schema import ConfigError, call_envs
+from cmrl_jax.config.schema import ConfigError, call_envs, require
 from cmrl_jax.evaluation import finetune_options
 from cmrl_jax.stop import is_interrupt
+from cmrl_jax.storage.kept_policies import is_kept
 from cmrl_jax.storage.output_files import distinct, writable
 from cmrl_jax.storage.run_dir import (
     find_run,
-    place_beside,
 )
 from envs.command_line import suggest, typed_path
 from envs.outputs import written_by
@@ -136,7 +137,7 @@ def _plot(words: list[str]) -> int:
 def _report(words: list[str]) -> int:
     args = parse(report_flags.add_flags(parser_of("report", report_flags.DESCRIPTION)), words)
     plot_flags.check_runs(args.run)
-    out = args.out or place_beside(find_run(args.run[0])) / "report.html"
+    out = args.out or args.run[0] / "report.html"
     writable(out, "--out", written_by("report"), args.force)
 
     from cmrl_jax.analysis import report
@@ -192,6 +193,8 @@ def _finetune(words: list[str]) -> int:
     parser = parser_of("finetune", finetune_flags.DESCRIPTION)
     args = parse(finetune_flags.add_flags(parser), words)
     options, run = finetune_flags.options_of(args), find_run(args.run)
+    cause = f"{args.run} comes with the project without the state that finetune goes on from"
+    require(not is_kept(run), cause, f"train one of your own: {command('--config', 'ml4.yaml')}")
     finetune_options.check_run(run_config(run), options)
     distinct(json=args.json, figure=args.figure)
     writable(args.json, "--json", written_by("finetune"), args.force)

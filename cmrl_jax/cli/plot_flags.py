@@ -8,7 +8,8 @@ from pathlib import Path
 
 from cmrl_jax.cli.flags import add_force, add_runs
 from cmrl_jax.config.files import run_config
-from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.config.schema import ConfigError, require
+from cmrl_jax.storage.kept_policies import is_kept
 from cmrl_jax.storage.run_dir import find_own_run, find_run
 from envs.command_line import typed_path
 
@@ -41,6 +42,8 @@ def check_runs(runs: Sequence[Path]) -> None:
     """
     places = [find_run(run).resolve() for run in runs]
     for run, place in zip(runs, places, strict=True):
+        cause = f"{run} comes with the project without the curves of its training"
+        require(not is_kept(place), cause, "give a run of your own, or eval it with --json")
         if places.count(place) > 1:
             raise ConfigError(f"--run {run} stands there twice", "name each run once")
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from cmrl_jax.cli.flags import COMMANDS, Parser, parse
 from cmrl_jax.cli.stop_signal import StopSignal
 from cmrl_jax.commands import command, program, shown
-from cmrl_jax.config.extras import is_installed, require_extras_of
+from cmrl_jax.config.extras import require_extras_of
 from cmrl_jax.config.files import (
     config_dirs,
     field_types,
@@ -142,9 +142,7 @@ def _in_console(runs: Sequence[tuple[Config, Path]], place: Path, stop: Stop, re
 
 
 def _report(runs: Sequence[Path], place: Path, console: Any) -> None:
-    """Writes a page of what was trained, where plotly is there; a run is done without it too."""
-    if not is_installed("report"):
-        return
+    """Writes a page of what was trained, or says why not: a run is done without it too."""
     from cmrl_jax.analysis.report import write_report
 
     try:

@@ -17,11 +17,6 @@ NEEDS = {
 }
 
 
-def is_installed(needed_by: str) -> bool:
-    """Whether all packages are there that something in `NEEDS` needs."""
-    return not _missing(needed_by)
-
-
 def require_extra(needed_by: str) -> None:
     """Raises ConfigError where a package is missing that something in `NEEDS` needs."""
     if missing := _missing(needed_by):

@@ -300,7 +300,10 @@ def _replace(config: Config, dotted: str, value: Any) -> Config:
             _unknown(section, prefix + section, cls, "", dotted)
         owner, cls, prefix = owner[section], field_types(cls)[section], f"{prefix}{section}."
     hint = field_types(cls).get(key)
-    if hint is None or is_dataclass(hint):
+    if is_dataclass(hint):
+        some = ", ".join(f"{dotted}.{f.name}" for f in fields(hint)[:3])
+        raise ConfigError(f"'{dotted}' is a section", f"name one of its keys: {some}, ...")
+    if hint is None:
         _unknown(key, dotted, cls, "")
     is_text = isinstance(value, str)
     owner[key] = parse_flag(value, hint, dotted) if is_text else _leaf(value, hint, dotted, "")

@@ -214,6 +214,7 @@ class _Training:
             run.start(columns, meta)
         self.evaluator = self.session.evaluator(policies=len(self.runs))
         self.clock = time.monotonic() - self.wall
+        self.started_at, self.paced_from = self.done, (self.done, self.wall)
         self.save()
 
     def in_step(self, state: RunState, metas: list[Any]) -> tuple[RunState, list[Any]]:
@@ -265,6 +266,8 @@ class _Training:
         if self.schedule.is_eval_due(self.done):
             rows = [row | found for row, found in zip(rows, self.evaluate(), strict=True)]
         self.wall = time.monotonic() - self.clock
+        if self.done <= self.started_at + 2:
+            self.paced_from = self.done, self.wall
         progress = Progress(self.share_done(), self.seconds_left())
         for run, row in zip(self.runs, rows, strict=True):
             run.write(row | {"wall_s": self.wall}, progress)
@@ -352,8 +355,14 @@ class _Training:
         return max(shares, default=0.0)
 
     def seconds_left(self) -> float:
-        share = self.share_done()
-        return self.wall * max(1 / share - 1, 0.0) if share else math.inf
+        """By the pace of this process since its second iteration: what comes before is compilation,
+        and an iteration that learns nothing."""
+        minutes, total = self.config.train.minutes, self.schedule.iterations
+        done, wall = self.paced_from
+        left = [60 * minutes - self.wall] if minutes else []
+        if total and self.done > done:
+            left.append((total - self.done) * (self.wall - wall) / (self.done - done))
+        return max(min(left), 0.0) if left and (not total or self.done > done) else math.inf
 
     def save(self) -> None:
         """A checkpoint of this border, of every run."""

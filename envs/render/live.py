@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import weakref
 
 import numpy as np
 
@@ -29,6 +30,8 @@ class LivePictures:
         self._task = task
         self._model = metaworld_scene(task, np.zeros(3))
         self._renderer = Renderer(self._model, SIZE, SIZE)
+        # Also at the interpreter's end, while what it needs is still there.
+        self._finalizer = weakref.finalize(self, self._renderer.close)
 
     def draw(self, qpos: np.ndarray, placement: np.ndarray) -> np.ndarray:
         """A picture (480, 480, 3) uint8 of a state qpos (10,), the fixture at `placement` (3,)."""
@@ -37,4 +40,4 @@ class LivePictures:
 
     def close(self) -> None:
         """Lets go of the GL context."""
-        self._renderer.close()
+        self._finalizer()

@@ -21,6 +21,14 @@ ROOT = Path(__file__).parents[2]
 NAMES = ["my run/a b", "it's", "$HOME", "a;b", "plain/run-1"]
 
 
+@pytest.fixture(autouse=True)
+def activated(monkeypatch):
+    """`python` is this Python, whoever runs the tests."""
+    which = commands.shutil.which
+    own = lambda name: sys.executable if name == "python" else which(name)
+    monkeypatch.setattr(commands.shutil, "which", own)
+
+
 @pytest.mark.parametrize(
     ("started", "program"),
     [
@@ -34,6 +42,17 @@ NAMES = ["my run/a b", "it's", "$HOME", "a;b", "plain/run-1"]
 def test_the_program_is_called_as_it_was_started(monkeypatch, started, program):
     monkeypatch.setattr(sys, "argv", [started])
     assert commands.program() == program
+
+
+def test_python_is_named_by_its_path_where_python_is_another_one(monkeypatch, tmp_path):
+    """As for who calls `make train` and has activated nothing."""
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(commands.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(sys, "executable", str(tmp_path / ".venv" / "bin" / "python"))
+    assert command("--resume") == ".venv/bin/python train.py --resume"
+    monkeypatch.setattr(sys, "executable", "/else where/bin/python")
+    assert command("--resume") == "'/else where/bin/python' train.py --resume"
 
 
 @pytest.mark.parametrize("name", NAMES)

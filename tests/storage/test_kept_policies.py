@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from cmrl_jax.cli.evaluate_flags import find_runs
-from cmrl_jax.cli.plot_flags import check_inspectable
+from cmrl_jax.cli.main import main
+from cmrl_jax.cli.plot_flags import check_inspectable, check_runs
 from cmrl_jax.cli.train import run_train
 from cmrl_jax.config.files import run_config
 from cmrl_jax.config.schema import ConfigError
@@ -59,7 +60,13 @@ def test_nothing_is_written_into_one(tmp_path, monkeypatch):
             run_train(["--run", run, "--resume"])
         assert "--config ml4.yaml" in raised.value.cure
         assert place_beside(find_run(Path(run))) == Path("runs") / NAME
-    with pytest.raises(ConfigError, match="comes with the project"):
-        check_inspectable(Path(NAME))
+    for refused in (
+        lambda: check_inspectable(Path(NAME)),
+        lambda: check_runs([Path(NAME)]),
+    ):
+        with pytest.raises(ConfigError, match="comes with the project"):
+            refused()
+    words = ["finetune", "--run", NAME, "--task", "window-close", "--json", "f.json"]
+    assert main(words) == 2
     assert place_beside(tmp_path) == tmp_path
     assert before == {path: path.stat().st_mtime_ns for path in kept.rglob("*")}

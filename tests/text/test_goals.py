@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cmrl_jax.commands import program
 from cmrl_jax.config.schema import GOAL_ABLATIONS, ConfigError
 from cmrl_jax.text import goal_files
 from cmrl_jax.text.goal_builder import all_vectors, read_prompts, task_cosines
@@ -178,7 +179,7 @@ def test_missing_table(tmp_path, monkeypatch):
     ):
         with pytest.raises(ConfigError, match=f"the goal table {table} is not there") as error:
             load_goals(table)
-        assert error.value.cure == f"build it: python train.py goals --encoder {encoder}"
+        assert error.value.cure == f"build it: {program()} goals --encoder {encoder}"
     with pytest.raises(ConfigError, match="the goal table my.npz is not there") as error:
         load_goals("my.npz")
     assert "--out my.npz" in error.value.cure
@@ -187,7 +188,7 @@ def test_missing_table(tmp_path, monkeypatch):
 def test_a_missing_table_is_reported_before_anything_is_begun(refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cause, cure = refused("--config", "ml4.yaml", "--goals.table", "mine/t.npz")
-    assert "mine/t.npz" in cause and "python train.py goals" in cure
+    assert "mine/t.npz" in cause and f"{program()} goals" in cure
     cause, cure = refused("--config", "ml4.yaml", "--goals.table", "shufled")
     assert "'shufled' (goals.table)" in cause and "did you mean 'shuffled'?" in cure
     assert not list(tmp_path.iterdir())
