@@ -14,7 +14,8 @@ import pytest
 
 from cmrl_jax.cli.main import main  # imports neither jax nor mujoco
 
-CACHE = Path(__file__).resolve().parent.parent / ".cache" / "jax-tests"
+# Not in `.cache`, which zensical empties whenever it builds the site.
+CACHE = Path(__file__).resolve().parent.parent / ".jax-cache"
 
 # Files of minutes: begun first, so that at the end no process is left with one of them.
 LONG = ("train", "finetune", "learner", "faults", "process", "parallel", "api", "film", "sweep")

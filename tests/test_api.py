@@ -107,7 +107,8 @@ def test_a_stop_from_another_thread_ends_a_run_that_goes_on(tmp_path, results, c
     ("overrides", "cause", "cure"),
     [
         ({"sac.bach": 64}, "unknown key 'sac.bach'", "sac.batch"),
-        ({"sac": 64}, "unknown key 'sac'", "valid"),
+        ({"sac": 64}, "'sac' is a section", "sac.variant"),
+        ({"sac": {"lr": 1}}, "'sac' is a section", "sac.variant"),
         ({"nosuch.batch": 64}, "unknown key 'nosuch.batch'", "valid"),
         ({"sac.batch": 64.5}, "sac.batch needs a whole number, got 64.5", "whole number"),
         ({"sac.batch": True}, "sac.batch needs a whole number", "whole number"),
