@@ -28,6 +28,11 @@ def pre_tanh(action: jax.Array) -> jax.Array:
     return jnp.arctanh(jnp.clip(action, -LARGEST, LARGEST))
 
 
+def action_of(head: Head, noise: jax.Array, is_quiet: jax.Array) -> jax.Array:
+    """Actions (lane, act) of a Head and normal noise, left out where `is_quiet` (lane, 1)."""
+    return jnp.tanh(head.mean + jnp.where(is_quiet, 0.0, jnp.exp(head.log_std)) * noise)
+
+
 def log_prob(head: Head, u: jax.Array) -> jax.Array:
     """Log density (...) of u (..., act)."""
     z = (u - head.mean) * jnp.exp(-head.log_std)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from cmrl_jax.algorithms.base import Told
+from cmrl_jax.algorithms.common.policy_gradient import PolicyParams
 from cmrl_jax.algorithms.common.replay import Transition
-from cmrl_jax.algorithms.maml.agent import MamlAgent, PolicyParams
+from cmrl_jax.algorithms.maml.agent import MamlAgent
 from cmrl_jax.algorithms.maml.baseline import RIDGE, baseline, features, returns_to_go
 from cmrl_jax.algorithms.maml.inner import Episodes, InnerStep
 from cmrl_jax.algorithms.maml.learner import Learner

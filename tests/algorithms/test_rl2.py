@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from cmrl_jax.algorithms.base import Told
+from cmrl_jax.algorithms.common.policy_gradient import PolicyParams
 from cmrl_jax.algorithms.common.replay import Transition
-from cmrl_jax.algorithms.rl2.agent import PolicyParams, Rl2Agent
+from cmrl_jax.algorithms.rl2.agent import Rl2Agent
 from cmrl_jax.algorithms.rl2.algorithm import Iteration, make
 from cmrl_jax.algorithms.rl2.learner import unroll
 from cmrl_jax.config.files import resolve

@@ -6,13 +6,21 @@ before it is followed by the step after it.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from cmrl_jax.config.schema import PpoConfig
+from cmrl_jax.nn.normalizers import ObsStats
+
+
+class PolicyParams(NamedTuple):
+    """What acting needs: the policy checkpoint's arrays."""
+
+    params: Any
+    obs_stats: ObsStats
 
 
 def gae(
@@ -82,3 +90,12 @@ def gradient_step(
     skipped = 1.0 - new_state.last_finite.astype(jnp.float32)
     figures = {"grad_norm": optax.tree.norm(grads), "skipped": skipped}
     return optax.apply_updates(params, updates), new_state, figures
+
+
+def learned(
+    optimizer: optax.GradientTransformation, state: Any, grads: Any
+) -> tuple[Any, dict[str, jax.Array]]:
+    """A learner's state (`params`, `opt_state`, `gradient_steps`) after a step, and its figures."""
+    params, opt_state, figures = gradient_step(optimizer, grads, state.opt_state, state.params)
+    count = optax.safe_increment(state.gradient_steps)
+    return state.replace(params=params, opt_state=opt_state, gradient_steps=count), figures

@@ -8,25 +8,19 @@ acted on one more step, on the episodes since.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from cmrl_jax.algorithms.base import Told
+from cmrl_jax.algorithms.common.policy_gradient import PolicyParams
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.algorithms.common.rollout import select_lanes
 from cmrl_jax.algorithms.maml.inner import Episodes, InnerStep
-from cmrl_jax.nn.gaussian_policy import Head, pre_tanh
-from cmrl_jax.nn.normalizers import ObsStats, normalize_obs
-
-
-class PolicyParams(NamedTuple):
-    """What acting needs: the policy checkpoint's arrays."""
-
-    params: Any
-    obs_stats: ObsStats
+from cmrl_jax.nn.gaussian_policy import Head, action_of, pre_tanh
+from cmrl_jax.nn.normalizers import normalize_obs
 
 
 class Memory(struct.PyTreeNode):
@@ -146,7 +140,7 @@ class MamlAgent:
         head = jax.vmap(of_lane)(memory.acting, normalize_obs(params.obs_stats, obs))
         # An episode that is learned from has its noise: there is no gradient without.
         quiet = (memory.exploit & deterministic)[:, None]
-        return jnp.tanh(head.mean + jnp.where(quiet, 0.0, jnp.exp(head.log_std)) * noise)
+        return action_of(head, noise, quiet)
 
     def observe(
         self, params: PolicyParams, memory: Memory, transitions: Transition, mask: jax.Array

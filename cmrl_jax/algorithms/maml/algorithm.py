@@ -27,6 +27,7 @@ import jax.numpy as jnp
 
 from cmrl_jax.algorithms.base import Algorithm, RunState, TrainIteration
 from cmrl_jax.algorithms.common.figures import figures_by_task
+from cmrl_jax.algorithms.common.policy_gradient import PolicyParams
 from cmrl_jax.algorithms.common.rollout import (
     StepStats,
     is_before_the_end,
@@ -34,7 +35,7 @@ from cmrl_jax.algorithms.common.rollout import (
     make_reset,
     rollout,
 )
-from cmrl_jax.algorithms.maml.agent import MamlAgent, PolicyParams
+from cmrl_jax.algorithms.maml.agent import MamlAgent
 from cmrl_jax.algorithms.maml.inner import Episodes, InnerStep
 from cmrl_jax.algorithms.maml.learner import Learner, LearnerState
 from cmrl_jax.config.schema import Config, lanes_per_task

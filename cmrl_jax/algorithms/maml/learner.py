@@ -6,12 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from cmrl_jax.algorithms.common.policy_gradient import (
     clipped_surrogate,
-    gradient_step,
+    learned,
     make_optimizer,
     masked_mean,
 )
@@ -98,11 +97,7 @@ class Learner:
             grads, metrics = jax.grad(self.loss, has_aux=True)(
                 state.params, inner, outer, advantage
             )
-            params, opt_state, figures = gradient_step(
-                self.optimizer, grads, state.opt_state, state.params
-            )
-            count = optax.safe_increment(state.gradient_steps)
-            state = state.replace(params=params, opt_state=opt_state, gradient_steps=count)
+            state, figures = learned(self.optimizer, state, grads)
             return state, metrics | figures
 
         state, metrics = jax.lax.scan(step, state, None, length=self.ppo.epochs)

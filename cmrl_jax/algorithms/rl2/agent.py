@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from cmrl_jax.algorithms.base import Told
+from cmrl_jax.algorithms.common.policy_gradient import PolicyParams
 from cmrl_jax.algorithms.common.replay import Transition
 from cmrl_jax.algorithms.common.rollout import select_lanes
+from cmrl_jax.nn.gaussian_policy import action_of
 from cmrl_jax.nn.normalizers import ObsStats, normalize_obs
 from cmrl_jax.nn.recurrent import Output, RecurrentActorCritic
-
-
-class PolicyParams(NamedTuple):
-    """What acting needs: the policy checkpoint's arrays."""
-
-    params: Any
-    obs_stats: ObsStats
 
 
 class Memory(struct.PyTreeNode):
@@ -91,7 +86,7 @@ class Rl2Agent:
     ) -> jax.Array:
         _, (head, _) = self.step(params, memory, obs)
         quiet = (memory.exploit & deterministic)[:, None]
-        return jnp.tanh(head.mean + jnp.where(quiet, 0.0, jnp.exp(head.log_std)) * noise)
+        return action_of(head, noise, quiet)
 
     def observe(
         self, params: PolicyParams, memory: Memory, transitions: Transition, mask: jax.Array

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 
 from cmrl_jax.algorithms.base import Algorithm, RunState, TrainIteration
 from cmrl_jax.algorithms.common.figures import figures_by_task
+from cmrl_jax.algorithms.common.policy_gradient import PolicyParams
 from cmrl_jax.algorithms.common.rollout import (
     StepStats,
     keys_of,
@@ -32,7 +33,7 @@ from cmrl_jax.algorithms.common.rollout import (
     rollout,
     select_lanes,
 )
-from cmrl_jax.algorithms.rl2.agent import Memory, PolicyParams, Rl2Agent
+from cmrl_jax.algorithms.rl2.agent import Memory, Rl2Agent
 from cmrl_jax.algorithms.rl2.learner import Learner, LearnerState, Trials
 from cmrl_jax.config.schema import Config, lanes_per_task
 from cmrl_jax.nn import normalizers
@@ -185,7 +186,7 @@ class Iteration:
         """What PPO learns from: rewards in units of the task, episodes one after another."""
         flat = lambda x: x.reshape(-1, *x.shape[2:])
         reward = steps.reward / self.denominator(state)[self.task]
-        # What would follow: one more episode, of which the last observation stands for the first.
+        # What would follow: one more episode, which begins as the last one did.
         again = memory.replace(start=jnp.ones(self.lanes))
         _, (_, last_value) = self.agent.step(params, again, steps.obs[-1, 0])
         found = map(flat, (steps.inputs, steps.u, steps.log_prob, steps.value, reward, steps.mask))

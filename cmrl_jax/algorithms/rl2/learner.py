@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from cmrl_jax.algorithms.common.policy_gradient import (
     clipped_surrogate,
     gae,
-    gradient_step,
+    learned,
     make_optimizer,
     masked_mean,
     normalized,
@@ -147,11 +146,7 @@ class Learner:
         def step(state: LearnerState, lanes: jax.Array):
             part = jax.tree.map(lambda x: x[:, lanes], batch)
             grads, metrics = jax.grad(self.loss, has_aux=True)(state.params, part)
-            params, opt_state, figures = gradient_step(
-                self.optimizer, grads, state.opt_state, state.params
-            )
-            count = optax.safe_increment(state.gradient_steps)
-            state = state.replace(params=params, opt_state=opt_state, gradient_steps=count)
+            state, figures = learned(self.optimizer, state, grads)
             return state, metrics | figures
 
         keys = jax.random.split(key, self.ppo.epochs)
