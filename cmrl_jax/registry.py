@@ -66,6 +66,7 @@ ENVIRONMENT_PARTS = (
     "tasks",
     "can_terminate",
     "symmetries",
+    "reaches",
     "reset",
     "reset_to",
     "step",

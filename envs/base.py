@@ -54,6 +54,9 @@ class MetaEnv(Protocol):
         symmetries: orthogonal matrices that observations (symmetry, observation_size,
             observation_size) and actions (symmetry, action_size, action_size) are multiplied by
             where the scene is seen mirrored or turned, the identity first.
+        reaches: matrices that observations (reach, observation_size, observation_size) are
+            multiplied by where an object is seen to have moved less or more far than it has, the
+            identity first. A policy that stops where the object was to go then takes it elsewhere.
     """
 
     observation_size: int
@@ -64,6 +67,9 @@ class MetaEnv(Protocol):
 
     @property
     def symmetries(self) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @property
+    def reaches(self) -> np.ndarray: ...
 
     def reset(self, key: jax.Array, task_id: jax.Array, /) -> Any:
         """A fresh episode of a task on a random goal: MetaState."""

@@ -38,6 +38,7 @@ PLANE_SYMMETRIES = np.array(
     ],
     np.float32,
 )
+REACHES = (1.0, 0.7)  # how far an object is seen to have moved, of how far it has
 OBS_MODES = ("metaworld", "canonical")
 
 
@@ -207,6 +208,22 @@ class Ml4Env:
                 of_obs[row, place : place + 2, place : place + 2] = matrix
             of_action[row, :2, :2] = matrix
         return of_obs, of_action
+
+    @property
+    def reaches(self) -> np.ndarray:
+        """As it is, then the object's movement as `REACHES` times what it is, and the hand with it.
+
+        The hand is moved with the object, so that what it does there looks the same. Only canonical
+        observations show how far an object has moved; others have the identity alone.
+        """
+        seen = REACHES if self.obs_mode == "canonical" else REACHES[:1]
+        matrices = np.tile(np.eye(OBS_SIZE, dtype=np.float32), (len(seen), 1, 1))
+        for start in (0, FRAME):
+            for axis in range(3):
+                hand, moved = start + HAND.start + axis, start + OBJECT.start + axis
+                matrices[:, moved, moved] = seen
+                matrices[:, hand, moved] = np.asarray(seen) - 1.0
+        return matrices
 
     def goals(self, name: str, tasks: Sequence[str] = TASKS) -> np.ndarray:
         """Placements of a named goal set, see `goal_sets.load_goal_set`."""

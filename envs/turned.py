@@ -1,4 +1,4 @@
-"""An environment as it is seen in one of its symmetries: mirrored, or turned."""
+"""An environment as an agent sees it that has chosen how: mirrored, turned, moved more or less."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ class TurnedEnv:
 
     Args:
         env: the original.
-        of_obs, of_action: orthogonal matrices, one entry each of `MetaEnv.symmetries`.
+        of_obs: an invertible matrix, one of `MetaEnv.symmetries` and `MetaEnv.reaches`.
+        of_action: an orthogonal one, of the same symmetry.
     """
 
     def __init__(self, env: MetaEnv, of_obs: np.ndarray, of_action: np.ndarray):
         self._env = env
         self._of_obs, self._of_action = jnp.asarray(of_obs), jnp.asarray(of_action)
+        self._to_obs = jnp.asarray(np.linalg.inv(of_obs))
         self.observation_size, self.action_size = env.observation_size, env.action_size
         self.goal_size, self.tasks = env.goal_size, env.tasks
         self.can_terminate = env.can_terminate
@@ -32,6 +34,11 @@ class TurnedEnv:
         """The identity: the view is chosen."""
         identity = lambda size: np.eye(size, dtype=np.float32)[None]
         return identity(self.observation_size), identity(self.action_size)
+
+    @property
+    def reaches(self) -> np.ndarray:
+        """The identity: it is chosen, too."""
+        return np.eye(self.observation_size, dtype=np.float32)[None]
 
     def reset(self, key: jax.Array, task_id: jax.Array) -> Any:
         """As the original's."""
@@ -43,7 +50,7 @@ class TurnedEnv:
 
     def step(self, state: Any, action: jax.Array) -> Any:
         """As the original's, after an action of the view."""
-        original = state.replace(obs=self._of_obs.T @ state.obs)
+        original = state.replace(obs=self._to_obs @ state.obs)
         return self._seen(self._env.step(original, self._of_action.T @ action))
 
     def goals(self, name: str, tasks: Sequence[str]) -> np.ndarray:

@@ -37,6 +37,7 @@ class LineEnv:
     tasks = tuple(TASKS)
     can_terminate = False
     symmetries = np.eye(2, dtype=np.float32)[None], np.eye(1, dtype=np.float32)[None]
+    reaches = np.eye(2, dtype=np.float32)[None]
 
     def reset(self, key: jax.Array, task_id: jax.Array) -> LineState:
         return self.reset_to(task_id, jax.random.uniform(key, (1,), minval=-0.1, maxval=0.1))

@@ -39,6 +39,7 @@ class PointEnv:
     tasks = tuple(TASKS)
     can_terminate = True
     symmetries = np.eye(3, dtype=np.float32)[None], np.eye(2, dtype=np.float32)[None]
+    reaches = np.eye(3, dtype=np.float32)[None]
 
     def reset(self, key: jax.Array, task_id: jax.Array) -> PointState:
         return self.reset_to(task_id, jax.random.uniform(key, (2,), minval=-0.2, maxval=0.2))

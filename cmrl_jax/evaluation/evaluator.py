@@ -128,17 +128,18 @@ class Evaluator:
         return self._compiled is not None
 
     def compile(self, params: Any, text_width: int) -> None:
-        """Compiles the episode for one policy's parameter shapes; later calls do not compile."""
+        """Compiles the episode for one policy's parameters, or their shapes; later calls do not."""
         if self._compiled is None:
             self._compiled = self.traced(params, text_width).lower().compile()
 
     def traced(self, params: Any, text_width: int) -> Any:
-        """The episode as jax traces it for one policy's parameter shapes."""
+        """The episode as jax traces it for one policy's parameters, or their shapes."""
         shape, zero = (self.policies, self.lanes), np.zeros(self.lanes, np.int32)
         text, ones = np.zeros((*shape, text_width), np.float32), np.ones(shape, np.float32)
         memory = self._blank(Told(text, ones, np.zeros(shape, np.int32)))
         lanes = Lanes(zero, zero, np.zeros((self.lanes, self._env.goal_size), np.float32))
-        stacked = _stack([params] * self.policies)
+        of_all = lambda x: jax.ShapeDtypeStruct((self.policies, *x.shape), x.dtype)
+        stacked = jax.tree.map(of_all, params)
         yes = np.bool_(True)
         return self._episode.trace(stacked, memory, memory, lanes, yes, yes, jax.random.key(0))
 

@@ -7,7 +7,7 @@ from the belief over all own transitions, no further adaptation. Normalisers sta
 and rewards are divided by the mean of the training tasks' denominators;
 `scratch` is SAC that knows nothing: its first episode has random actions, and it keeps statistics
 of its own. `search` spends its first episodes as `eval --adapt search` does, without gradients, and
-goes on from the winner: its z is a parameter, and the task is seen in its view.
+goes on from the winner: its z is a parameter, and the task is seen as its arm sees it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Score(NamedTuple):
 
 
 class Winner(NamedTuple):
-    """What a search has found: z (latent,), and the view's matrices of observation and action."""
+    """What a search has found: z (latent,), and the arm's matrices of observation and action."""
 
     z: jax.Array
     of_obs: np.ndarray

@@ -70,9 +70,9 @@ class EvalOptions:
         policy: deterministic (tanh of the mean) or sampled actions.
         z: what an episode is acted on; posterior is the protocol, the others are controls
             (controls.py).
-        adapt: what own episodes change: the belief over z, or which of many z's and mirrors is
-            chosen (`algorithms/cmrl/search.py`); arms: a control, after k episodes comes the k-th
-            of those, whatever they earn.
+        adapt: what own episodes change: the belief over z, or which arm is chosen (a z and a way to
+            see the scene, `algorithms/cmrl/search.py`); arms: a control, after k episodes comes the
+            k-th arm, whatever they earn.
         protocol: goal: each goal is adapted to by itself; task: each draw adapts once, on goals of
             the `train` set, and is scored on all goals.
         paraphrases: sentences of the table, the first trained on or the held-out ones.

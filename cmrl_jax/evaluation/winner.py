@@ -1,4 +1,4 @@
-"""Search before fine-tuning: the first episodes choose the z and the view that it goes on from."""
+"""Search before fine-tuning: the first episodes choose the arm that it goes on from."""
 
 from __future__ import annotations
 
@@ -49,6 +49,4 @@ def search_winner(
         if played.is_counted:
             say(played.number, mean_score(played.score))
             last = played.after  # every lane's is the task's one search
-    of_obs, of_action = agent.symmetries
-    view = int(last.arm[0, 0]) % agent.views
-    return Winner(jnp.asarray(last.z[0, 0]), of_obs[view], of_action[view])
+    return Winner(jnp.asarray(last.z[0, 0]), *agent.matrices(int(last.arm[0, 0])))

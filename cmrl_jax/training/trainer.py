@@ -12,6 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -176,8 +177,7 @@ class _Training:
         self.program = self.session.training(parallel.make_mesh(), len(self.runs))
         self.start(resume)
         if self.iterations_left() and not self.stop.requested:
-            if not self.program.is_compiled:
-                self.timed("the training iteration", self.program.compile)
+            self.compile_programs()
             self.iteration = self.program.compile()
         while self.iterations_left() and not self.stop.requested:
             self.step()
@@ -237,13 +237,29 @@ class _Training:
                 metas[i] = found.meta
         return state, metas
 
-    def timed(self, what: str, compile: Callable[[], Any]) -> Any:
-        """Announces a compile and says how long it took."""
+    def compile_programs(self) -> None:
+        """What is not compiled yet of what training needs."""
+        programs: dict[str, tuple[Any, Callable[[], Any]]] = {
+            "the training iteration": (self.program, self.program.compile),
+            "the evaluation episode": (self.evaluator, self.compile_evaluation),
+        }
+        self.timed({name: go for name, (it, go) in programs.items() if not it.is_compiled})
+
+    def compile_evaluation(self) -> None:
+        params = jax.eval_shape(self.algorithm.policy_params, self.program.one)
+        self.evaluator.compile(params, self.session.goals.vectors.shape[-1])
+
+    def timed(self, programs: dict[str, Callable[[], Any]]) -> None:
+        """Compiles programs side by side, and says how long each took: XLA keeps little more than
+        one core busy with each, and works outside Python's lock."""
         started = time.monotonic()
-        self.say(f"compiling {what} ...")
-        result = compile()
-        self.say(f"compiling {what} took {time.monotonic() - started:.1f} s")
-        return result
+        with ThreadPoolExecutor(max(len(programs), 1)) as pool:
+            pending = {pool.submit(compile): name for name, compile in programs.items()}
+            if programs:
+                self.say(f"compiling {' and '.join(programs)} ...")
+            for one in as_completed(pending):
+                one.result()
+                self.say(f"compiling {pending[one]} took {time.monotonic() - started:.1f} s")
 
     def iterations_left(self) -> bool:
         minutes, total = self.config.train.minutes, self.schedule.iterations
@@ -341,9 +357,7 @@ class _Training:
         policies = [parallel.on_one_device(act(state)) for state in states]
         trial = self.session.trial(self.config.eval.goal_set, goals)
         if not self.evaluator.is_compiled:
-            width = trial.texts.shape[-1]
-            compile = lambda: self.evaluator.compile(policies[0], width)
-            self.timed("the evaluation episode", compile)
+            self.timed({"the evaluation episode": self.compile_evaluation})
         scores = self.evaluator.run(policies, trial, k, self.config.eval.seed, check)
         return [summarise(of_policy(scores, i), trial.tasks) for i in range(len(policies))]
 

@@ -21,6 +21,8 @@ from cmrl_jax.nn.context import init_belief
 TURN = np.eye(3, dtype=np.float32)
 TURN[:2, :2] = [[0, 1], [-1, 0]]
 VIEWS = np.stack([np.eye(OBS, dtype=np.float32), TURN]), np.stack([np.eye(ACT), TURN[:2, :2]])
+# As it is, and with the last number as half and as twice what it is.
+REACHES = np.stack([np.diag([1.0, 1.0, seen]).astype(np.float32) for seen in (1.0, 0.5, 2.0)])
 ARMS, LANES, STEPS = 2 * (TASKS + 1), 3, 10
 TOLD = Told(
     np.asarray(GOALS[:1, 1].repeat(LANES, 0)), np.ones(LANES, np.float32), np.zeros(LANES, int)
@@ -39,8 +41,8 @@ def params(made):
     return PolicyParams(state.actor_params, state.encoder_params, state.obs_stats, task_z)
 
 
-def agent_of(made):
-    return SearchAgent(made.learner, STEPS, VIEWS)
+def agent_of(made, reaches=REACHES[:1]):
+    return SearchAgent(made.learner, STEPS, VIEWS, reaches)
 
 
 def transitions(reward):
@@ -53,8 +55,8 @@ def transitions(reward):
 class Trial:
     """Episodes one after the other, whose rewards are a function of the arm."""
 
-    def __init__(self, made, params, value):
-        self.agent, self.params, self.value = agent_of(made), params, value
+    def __init__(self, made, params, value, reaches=REACHES[:1]):
+        self.agent, self.params, self.value = agent_of(made, reaches), params, value
         self.memory = self.agent.init(TOLD)
         self.begin = jax.jit(self.agent.begin_episode)
         self.observe = jax.jit(self.agent.observe)
@@ -82,7 +84,7 @@ def test_every_arm_is_tried_once_and_then_fewer_and_fewer_of_the_best(made, para
     trial = Trial(made, params, constant)
     tried = np.stack([trial.play() for _ in range(BUDGET)])  # (episode, lane)
     assert (np.sort(tried[:ARMS], 0) == np.arange(ARMS)[:, None]).all()
-    kept, starts = rounds_of(2, TASKS)
+    kept, starts, _ = trial.agent.rounds
     assert kept == 2 and starts[:3] == (0, 2, ARMS) and starts[-1] == BUDGET
     for lane in range(LANES):
         ranked = sorted(range(ARMS), key=lambda arm: abs(arm - 5 - lane))
@@ -98,7 +100,7 @@ def test_the_own_z_is_tried_first_and_says_in_which_views_the_others_are(made, p
     """Lane 0's own z earns more in the turned view, the others' more as it is."""
     monkeypatch.setattr(search, "BUDGET", 6)  # of two views one is kept
     monkeypatch.setattr(search, "rounds_of", functools.partial(rounds_of, budget=6))
-    assert rounds_of(2, TASKS, 6).views == 1
+    assert rounds_of(2, TASKS, budget=6).views == 1
     better = [1, 0, 0]
     value = lambda lane, arm: np.full(STEPS, float(arm % 2 == better[lane]) + 0.1 * arm)
     trial = Trial(made, params, value)
@@ -109,16 +111,36 @@ def test_the_own_z_is_tried_first_and_says_in_which_views_the_others_are(made, p
     assert (trial.play(exploit=True) == [7, 6, 6]).all()
 
 
+def test_the_best_arm_is_tried_with_every_other_reach(made, params):
+    """Lane l's best z and view is 5 + l; it earns most with the last reach."""
+    value = lambda lane, arm: constant(lane, arm % ARMS) + 0.1 * (arm // ARMS)
+    trial = Trial(made, params, value, REACHES)
+    tried = np.stack([trial.play() for _ in range(BUDGET)])
+    best = 5 + np.arange(LANES)
+    begin = trial.agent.rounds.reaching
+    assert begin is not None and begin > ARMS and (tried[:begin] < ARMS).all()
+    np.testing.assert_array_equal(tried[begin : begin + 2], [ARMS + best, 2 * ARMS + best])
+    # After it the best arms again, whatever their reach.
+    assert (tried[begin + 2] == 2 * ARMS + best).all()
+    assert (trial.play(exploit=True) == 2 * ARMS + best).all()
+    assert trial.agent.describe(trial.memory)[0].endswith(", reach 2 of 2")
+
+
 def test_rounds_end_with_the_budget_and_halve_what_is_left():
-    assert rounds_of(8, 3) == (3, (0, 8, 17, 18, 19, 20))  # Meta-World's, three training tasks
-    assert rounds_of(4, 3) == (4, (0, 4, 16, 18, 19, 20))
+    # Meta-World's views and reaches, three training tasks.
+    assert rounds_of(8, 3, 2) == (2, (0, 8, 14, 17, 18, 19, 20), 17)
+    assert rounds_of(8, 3) == (2, (0, 8, 14, 17, 18, 19, 20), None)
+    assert rounds_of(8, 3, 5).reaching is None  # three episodes are left, too few
     for views in range(1, 9):
         for tasks in range(1, 10):
-            kept, starts = rounds_of(views, tasks)
-            assert 1 <= kept <= views and starts[:2] == (0, views)
-            assert starts[2] == views + kept * tasks and starts[-1] == BUDGET
-            sizes = np.diff(starts[2:])
-            assert (sizes >= 1).all() and (sizes <= max(starts[2] // 2, 1)).all()
+            for reaches in (1, 3):
+                kept, starts, reaching = rounds_of(views, tasks, reaches)
+                assert 1 <= kept <= views and starts[:2] == (0, views)
+                assert starts[2] == views + kept * tasks and starts[-1] == BUDGET
+                sizes = dict(zip(starts[2:], np.diff(starts[2:]), strict=False))
+                if reaching is not None:
+                    assert reaching == starts[3] and sizes.pop(reaching) == reaches - 1
+                assert all(1 <= size <= max(starts[2] // 2, 1) for size in sizes.values())
 
 
 @pytest.mark.parametrize("tasks", [1, 2, 3])
@@ -129,7 +151,7 @@ def test_few_arms_are_searched_to_the_end(made, params, tasks):
     config = tiny_config()
     config = replace(config, tasks=replace(config.tasks, train=config.tasks.train[:tasks]))
     few = Learner(config, GOALS[:tasks], OBS, ACT)
-    trial.agent = SearchAgent(few, STEPS, identity)
+    trial.agent = SearchAgent(few, STEPS, identity, REACHES[:1])
     trial.memory = trial.agent.init(TOLD)
     trial.begin = jax.jit(trial.agent.begin_episode)
     for _ in range(BUDGET + 3):
@@ -153,7 +175,7 @@ def test_an_episode_that_counts_takes_the_best_arm_and_teaches_nothing(made, par
 
 def test_arms_in_turn_are_played_whatever_they_earn(made, params):
     trial = Trial(made, params, constant)
-    trial.agent = ArmsInTurn(made.learner, STEPS, VIEWS)
+    trial.agent = ArmsInTurn(made.learner, STEPS, VIEWS, REACHES[:1])
     trial.begin = jax.jit(trial.agent.begin_episode)
     for arm in [*range(ARMS), 0, 1]:
         assert (trial.play(exploit=True) == arm).all()
@@ -202,9 +224,9 @@ def test_a_step_that_is_masked_earns_nothing(made, params):
     np.testing.assert_array_equal(after.returns, [STEPS, 3, STEPS])
 
 
-def test_an_arm_is_a_tasks_z_in_a_view(made, params):
-    """Action of arm (z, view) = the policy's on what is seen in the view, turned back."""
-    agent, learner = agent_of(made), made.learner
+def test_an_arm_is_a_tasks_z_in_a_view_with_a_reach(made, params):
+    """Action of arm (z, view, reach) = the policy's on what the arm sees, turned back."""
+    learner = made.learner
     k_obs, k_noise = jax.random.split(jax.random.key(1))
     obs, noise = jax.random.normal(k_obs, (LANES, OBS)), jax.random.normal(k_noise, (LANES, ACT))
     own = learner.inference.posterior_of_belief(
@@ -212,19 +234,26 @@ def test_an_arm_is_a_tasks_z_in_a_view(made, params):
     )
     z_of = np.concatenate([own.mean, params.task_z])
     keys = jax.random.split(jax.random.key(0), LANES)
-    trial = Trial(made, params, constant)
-    for _ in range(ARMS):
+    trial = Trial(made, params, lambda lane, arm: np.full(STEPS, float(arm)), REACHES)
+    seen_with = set()
+    for _ in range(BUDGET):
         begun = trial.begin(params, trial.memory, trial.memory, keys, np.bool_(False))
         [arm] = set(begun.arm.tolist())
-        z = np.broadcast_to(z_of[arm // 2], (LANES, LATENT))
+        reach, rest = divmod(arm, ARMS)
+        seen_with.add(reach)
+        z = np.broadcast_to(z_of[rest // 2], (LANES, LATENT))
         np.testing.assert_allclose(begun.z, z, rtol=1e-5)
-        of_obs, of_action = (matrices[arm % 2] for matrices in VIEWS)
+        of_obs, of_action = (matrices[rest % 2] for matrices in VIEWS)
+        of_obs = REACHES[reach] @ of_obs
+        for found, wanted in zip(trial.agent.matrices(arm), (of_obs, of_action), strict=True):
+            np.testing.assert_array_equal(found, wanted)
         seen, _ = learner.policy(
             params.actor_params, params.obs_stats, obs @ of_obs.T, z, None, False, noise
         )
-        got = agent.act(params, begun, obs, noise, False)
+        got = trial.agent.act(params, begun, obs, noise, False)
         np.testing.assert_allclose(got @ of_action.T, seen, rtol=1e-5, atol=1e-6)
         trial.play()
+    assert seen_with == {0, 1, 2}
 
 
 def test_another_lanes_experience_decides_what_is_acted_on(made, params):

@@ -1,8 +1,9 @@
-"""An environment seen in one of its symmetries."""
+"""An environment seen as an arm of a search sees it."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from point_env import PointEnv
 
 from envs.turned import TurnedEnv
@@ -10,11 +11,12 @@ from envs.turned import TurnedEnv
 TURN = np.array([[0, 1], [-1, 0]], np.float32)
 
 
-def test_actions_are_turned_back_and_observations_forth():
+@pytest.mark.parametrize("seen", [1.0, 0.5])
+def test_actions_are_turned_back_and_observations_forth(seen):
     """In the view, the same walk: right is what the original calls up, or down."""
     env, size = PointEnv(), PointEnv.observation_size
     of_obs = np.eye(size, dtype=np.float32)
-    of_obs[:2, :2] = TURN
+    of_obs[:2, :2] = seen * TURN
     turned = TurnedEnv(env, of_obs, TURN)
     goal = jnp.array([0.3, -0.2])
     original, seen = env.reset_to(jnp.asarray(1), goal), turned.reset_to(jnp.asarray(1), goal)

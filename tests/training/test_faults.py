@@ -86,7 +86,7 @@ def test_a_second_signal_stops_at_once_even_in_a_compile(tmp_path):
                 process.send_signal(signal.SIGTERM)
         assert process.wait() == 128 + signal.SIGTERM
     assert lines[-2:] == [
-        "compiling the training iteration ...\n",
+        "compiling the training iteration and the evaluation episode ...\n",
         "stopping at the end of this iteration; once more stops at once\n",
     ]
     assert steps(run) == [0]

@@ -39,8 +39,9 @@ def make(config: Config, env: MetaEnv, goal_vectors: jax.Array) -> Algorithm:
 
     agents: dict[str, Agent] = {"posterior": CmrlAgent(learner, config.collect.chunk)}
     if learner.inference is not None:
-        agents["search"] = SearchAgent(learner, config.collect.chunk, env.symmetries)
-        agents["arms"] = ArmsInTurn(learner, config.collect.chunk, env.symmetries)
+        seen = env.symmetries, env.reaches
+        agents["search"] = SearchAgent(learner, config.collect.chunk, *seen)
+        agents["arms"] = ArmsInTurn(learner, config.collect.chunk, *seen)
     return Algorithm(
         agents=agents,
         init=lambda key: init_run(config, env, learner, key),

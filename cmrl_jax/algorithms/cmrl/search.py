@@ -1,13 +1,14 @@
-"""Adaptation by search: which z, and which view of the scene, earns most on the task at hand.
+"""Adaptation by search: which z, and which way of seeing the scene, earns most on the task at hand.
 
-An arm is a z and a symmetry of the environment (`MetaEnv.symmetries`), a view: the z of the task's
+An arm is a z, a view (`MetaEnv.symmetries`) and a reach (`MetaEnv.reaches`): the z of the task's
 own sentence (the prior's mean without text) or that of a training task, acting in the scene as it
-is seen mirrored or turned. Exploring episodes try the task's own z in every view, then the training
-tasks' in the best of those, then the best arms again by successive halving (Karnin et al. 2013:
-sequential halving). A counted episode takes the best arm so far and teaches nothing. Arms are
-judged by rewards alone: the return, and as much again for the best few steps, since waiting at an
-object can pay as much as moving it late. Everything is data in the compiled episode, so one program
-plays any budget.
+is seen mirrored or turned, and with the object moved less or more far than it is. Exploring
+episodes try the task's own z in every view, then the training tasks' in the best of those, then the
+best arms again by successive halving (Karnin et al. 2013: sequential halving), among them the best
+arm with every other reach. A counted episode takes the best arm so far and teaches nothing. Arms
+are judged by rewards alone: the return, and as much again for the best few steps, since waiting at
+an object can pay as much as moving it late. Everything is data in the compiled episode, so one
+program plays any budget.
 """
 
 from __future__ import annotations
@@ -68,21 +69,27 @@ class Rounds(NamedTuple):
         starts: after how many episodes each round begins, ascending from 0: the own z in every
             view, the training tasks' in `views` of them, then rounds of the best arms so far, each
             half of what is left and at most half of the arms tried; the last is the end.
+        reaching: after how many the best arm's other reaches are tried, a round of its own after
+            the first of the best arms; None where there are none.
     """
 
     views: int
     starts: tuple[int, ...]
+    reaching: int | None = None
 
 
-def rounds_of(views: int, tasks: int, budget: int = BUDGET) -> Rounds:
-    """The rounds for a number of views and of training tasks; a quarter is kept for the last."""
-    kept = max(1, min(views, (budget - views) * 3 // 4 // tasks))
-    tried = done = views + kept * tasks
-    starts = [0, views]
-    while done < budget:
-        starts.append(done)
-        done += max(1, min((budget - done) // 2, tried // 2))
-    return Rounds(kept, (*starts, done))
+def rounds_of(views: int, tasks: int, reaches: int = 1, budget: int = BUDGET) -> Rounds:
+    """The rounds for a number of views, training tasks and reaches; half of what the views leave is
+    kept for those after the second."""
+    kept = max(1, min(views, (budget - views) // 2 // tasks))
+    tried, reaching = views + kept * tasks, None
+    starts = [0, views, tried]
+    while (done := starts[-1]) < budget:
+        starts.append(done + max(1, min((budget - done) // 2, tried // 2)))
+        if reaching is None and 1 < reaches <= budget - starts[-1] + 1:
+            reaching = starts[-1]
+            starts.append(reaching + reaches - 1)
+    return Rounds(kept, tuple(starts), reaching)
 
 
 @dataclass(frozen=True)
@@ -92,12 +99,13 @@ class SearchAgent:
     Args:
         learner: with a latent.
         chunk: control steps between two calls of `observe`.
-        symmetries: of the environment, the identity first.
+        symmetries, reaches: of the environment, the identity first.
     """
 
     learner: Learner
     chunk: int
     symmetries: tuple[np.ndarray, np.ndarray]
+    reaches: np.ndarray
 
     adapts = True
     explores = True
@@ -108,12 +116,25 @@ class SearchAgent:
 
     @property
     def rounds(self) -> Rounds:
-        return rounds_of(self.views, self.learner.num_tasks)
+        return rounds_of(self.views, self.learner.num_tasks, len(self.reaches))
 
     @property
     def arms(self) -> int:
-        """Their number; arm a is z a div N, the task's own first, in view a mod N of N."""
+        """Their number: reach by reach, in each z by z, the task's own first, and view by view."""
+        return len(self.reaches) * self._of_reach
+
+    @property
+    def _of_reach(self) -> int:
         return (1 + self.learner.num_tasks) * self.views
+
+    def parts(self, arm: Any) -> tuple[Any, Any, Any]:
+        """Reach, z and view of an arm."""
+        return arm // self._of_reach, arm % self._of_reach // self.views, arm % self.views
+
+    def matrices(self, arm: int) -> tuple[np.ndarray, np.ndarray]:
+        """What an arm multiplies observations by, and what undoes it for actions (transposed)."""
+        (of_obs, of_action), (reach, _, view) = self.symmetries, self.parts(arm)
+        return self.reaches[reach] @ of_obs[view], of_action[view]
 
     def init(self, told: Told) -> SearchMemory:
         lead, inference = told.task_row.shape, self._inference
@@ -149,7 +170,7 @@ class SearchAgent:
         memory, source = _credited(memory, horizon), _credited(source, horizon)
         order = self._order(source)
         tried = self._chosen(source, order, exploit)
-        z = self._z_of(params, source, tried // self.views)
+        z = self._z_of(params, source, self.parts(tried)[1])
         learns = jnp.where(exploit, jnp.zeros_like(memory.learns), 1.0)
         return replace(memory, order=order, arm=tried, learns=learns, z=z)
 
@@ -161,20 +182,19 @@ class SearchAgent:
         noise: jax.Array,
         deterministic: Any,
     ) -> jax.Array:
-        of_obs, of_action = (jnp.asarray(matrix)[self._view(memory)] for matrix in self.symmetries)
+        reach, _, view = self.parts(memory.arm)
+        of_obs, of_action = (jnp.asarray(matrix)[view] for matrix in self.symmetries)
+        turned = jnp.einsum("...ij,...j->...i", of_obs, obs)
         seen, _ = self.learner.policy(
             params.actor_params,
             params.obs_stats,
-            jnp.einsum("...ij,...j->...i", of_obs, obs),
+            jnp.einsum("...ij,...j->...i", jnp.asarray(self.reaches)[reach], turned),
             memory.z,
             None,
             deterministic,
             noise,
         )
         return jnp.einsum("...ij,...i->...j", of_action, seen)  # back: the inverse is the transpose
-
-    def _view(self, memory: SearchMemory) -> jax.Array:
-        return memory.arm % self.views
 
     def observe(
         self, params: PolicyParams, memory: SearchMemory, transitions: Transition, mask: jax.Array
@@ -192,12 +212,14 @@ class SearchAgent:
         )
 
     def describe(self, memory: SearchMemory) -> list[str]:
-        """The arm of each lane's episode: whose z, and in which view but the identity."""
+        """The arm of each lane's episode: whose z, in which view and reach but the identity."""
         names = ("own z", *(f"z of {task}" for task in self.learner.config.tasks.train))
         words = []
         for arm in np.asarray(memory.arm):
-            z, view = divmod(int(arm), self.views)
-            words.append(names[z] + (f", view {view} of {self.views - 1}" if view else ""))
+            reach, z, view = self.parts(int(arm))
+            seen = f", view {view} of {self.views - 1}" if view else ""
+            seen += f", reach {reach} of {len(self.reaches) - 1}" if reach else ""
+            words.append(names[z] + seen)
         return words
 
     def _chosen(self, memory: SearchMemory, order: jax.Array, exploit: jax.Array) -> jax.Array:
@@ -210,6 +232,8 @@ class SearchAgent:
         ranked = jnp.argsort(-_means(memory), axis=-1).astype(jnp.int32)
         begins = jnp.any(done == jnp.array(later), -1, keepdims=True) | (done > later[-1])
         order = jnp.where(begins, ranked, memory.order)
+        if self.rounds.reaching is not None:
+            order = jnp.where(done == self.rounds.reaching, self._other_reaches(ranked), order)
         return jnp.where(done == second, self._trained_in_best_views(memory), order)
 
     def _trained_in_best_views(self, memory: SearchMemory) -> jax.Array:
@@ -218,9 +242,16 @@ class SearchAgent:
         views = jnp.argsort(-_means(memory)[..., : self.views], axis=-1)[..., :kept]
         z = 1 + np.arange(tasks)
         arms = z * self.views + views[..., None]  # (lane, view, z)
-        arms = arms.reshape(*arms.shape[:-2], -1).astype(jnp.int32)
+        return self._padded(arms.reshape(*arms.shape[:-2], -1))
+
+    def _other_reaches(self, ranked: jax.Array) -> jax.Array:
+        """The best arm with every reach but the identity; the rest is not tried."""
+        best = ranked[..., :1] % self._of_reach
+        return self._padded(best + self._of_reach * np.arange(1, len(self.reaches)))
+
+    def _padded(self, arms: Any) -> jax.Array:
         rest = [(0, 0)] * (arms.ndim - 1) + [(0, self.arms - arms.shape[-1])]
-        return jnp.pad(arms, rest)
+        return jnp.pad(arms.astype(jnp.int32), rest)
 
     def _next(self, memory: SearchMemory, order: jax.Array) -> jax.Array:
         """The arm that the round at hand tries next; after the last round the best one."""
