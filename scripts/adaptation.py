@@ -3,7 +3,8 @@
 Each of the four tasks is held out once, a fold, with five seeds. `train` makes the runs, one after
 another; what is finished is left alone and what was stopped goes on, so it can be stopped and given
 again at any time. Runs go to runs/adaptation/NAME; config, versions, command and the last policy of
-each are copied to results/adaptation/policies/NAME. `score` evaluates those copies, one JSON an
+each are copied to results/adaptation/policies/NAME, learning curves of RL2 and MAML to
+results/adaptation/curves/NAME. `score` evaluates those copies, one JSON an
 evaluation in results/adaptation/scores/NAME; what is there already is not run again. `finetune`
 goes on from the winner of a search with gradient steps, beside SAC from scratch, for one seed a
 fold: it needs the run itself. `table` puts
@@ -34,6 +35,7 @@ from cmrl_jax.evaluation.statistics import seeds_interval  # noqa: E402
 from cmrl_jax.storage.documents import read_json  # noqa: E402
 from cmrl_jax.storage.packed import pack  # noqa: E402
 from cmrl_jax.storage.run_files import EVALUATION  # noqa: E402
+from scripts import experiments  # noqa: E402
 from scripts.experiments import refused  # noqa: E402
 
 RUNS, RESULTS = Path("runs/adaptation"), Path("results/adaptation")
@@ -75,15 +77,14 @@ EVALUATIONS = {  # flags of `eval`; native physics unless they say otherwise
     "metaworld-own": "--physics metaworld --k 0",
 }
 _OF_PEARL = ("posterior-task", "posterior-goal", "search-task", "search-goal", "trained")
+META_RL = ("rl2", "maml")
 _OF_META_RL = ("posterior-task", "posterior-goal", "trained-goal", "metaworld-own")
 OF_KIND = {
     "cmrl": tuple(x for x in EVALUATIONS if x not in ("metaworld-own", "trained-goal")),
     "pearl": _OF_PEARL,
     "pearlsac": _OF_PEARL,
     "untrained": ("search-task", "search-goal"),
-    "rl2": _OF_META_RL,
-    "maml": _OF_META_RL,
-}
+} | dict.fromkeys(META_RL, _OF_META_RL)
 FINETUNE = "finetune"  # from the winner of a search, and SAC from scratch; needs the run itself
 
 
@@ -141,6 +142,8 @@ def keep(name: str) -> None:
         shutil.copy(run / file, kept / file)
     spoken = f"python {shlex.join(train_command(name)).removesuffix(' --resume')}\n"
     (kept / "command.txt").write_text(spoken, encoding="utf-8")
+    if parts(name)[0] in META_RL:
+        experiments.keep(run, RESULTS / "curves" / name, train_command(name))
 
 
 def train(names: list[str]) -> int:

@@ -93,9 +93,12 @@ def command(name: str) -> list[str]:
     return words + (["--resume"] if (run / "config.yaml").exists() else [])
 
 
-def keep(name: str) -> None:
-    """Copies what results/ keeps of a finished run; the metrics thinned to `CSV_ROWS` rows."""
-    run, kept = RUNS / name, RESULTS / name
+def keep(run: Path, kept: Path, words: list[str]) -> None:
+    """Copies what results/ keeps of a finished run; the metrics thinned to `CSV_ROWS` rows.
+
+    Args:
+        words: what a user would type for the run.
+    """
     # Read first: a damaged file does not take the place of the one that is kept.
     header, by_line = read_csv(run / METRICS, "put it back from a copy, or run the experiment anew")
     rows = list(by_line.values())
@@ -114,7 +117,7 @@ def keep(name: str) -> None:
     ]
     with (kept / METRICS).open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *thinned])
-    spoken = f"python {shlex.join(command(name)).removesuffix(' --resume')}\n"
+    spoken = f"python {shlex.join(words).removesuffix(' --resume')}\n"
     (kept / "command.txt").write_text(spoken, encoding="utf-8")
 
 
@@ -137,7 +140,7 @@ def main(words: list[str]) -> int:
             code = subprocess.run([sys.executable, *command(name)], cwd=ROOT).returncode
             if code or not (RUNS / name / EVALUATION).exists():
                 return code or 1  # stopped: the next call goes on with it
-        keep(name)
+        keep(RUNS / name, RESULTS / name, command(name))
     return 0
 
 

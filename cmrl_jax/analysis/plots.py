@@ -32,7 +32,8 @@ def _pyplot(needed_by: str = "plot") -> Any:
 def _panels(pyplot: Any, runs: Runs, ylabel: str) -> tuple[Any, dict[str, Any]]:
     """A figure with one panel a task."""
     count = len(runs.tasks)
-    figure, axes = pyplot.subplots(1, count, figsize=(3.4 * count, 3.2), sharey=True, squeeze=False)
+    size, shared = (3.4 * count, 3.2), {"sharex": True, "sharey": True}
+    figure, axes = pyplot.subplots(1, count, figsize=size, squeeze=False, **shared)
     for task, axis in zip(runs.tasks, axes[0], strict=True):
         axis.set_title(task + (" (held out)" if runs.is_held_out(task) else ""))
     axes[0, 0].set_ylabel(ylabel)

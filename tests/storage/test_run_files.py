@@ -179,14 +179,13 @@ def test_results_keep_no_damaged_run(tmp_path, monkeypatch):
     """scripts/experiments.py replaces nothing before it has read what it copies."""
     monkeypatch.syspath_prepend(ROOT)
     experiments = importlib.import_module("scripts.experiments")
-    for name in ("RUNS", "RESULTS"):
-        monkeypatch.setattr(experiments, name, tmp_path / name)
+    kept, words = tmp_path / "kept", ["train.py", "--config", "pearl.yaml", "--resume"]
     header, *rows = CSV.splitlines()
     many = [header, rows[1], *[f"{n},{n}00,0.5," for n in range(3, 300)]]
-    run = write_run(tmp_path / "RUNS" / "pearl", "\n".join(many) + "\n", {0: 0.2})
+    run = write_run(tmp_path / "run", "\n".join(many) + "\n", {0: 0.2})
     (run / "versions.json").write_text("{}")
-    experiments.keep("pearl")
-    kept = tmp_path / "RESULTS" / "pearl"
+    experiments.keep(run, kept, words)
+    assert (kept / "command.txt").read_text() == "python train.py --config pearl.yaml\n"
     thinned = (kept / "metrics.csv").read_text()
     # Every third row, the evaluated one and the last, as they were written.
     assert thinned.splitlines() == [many[0], *many[1:-1:3], many[-1]]
@@ -194,7 +193,7 @@ def test_results_keep_no_damaged_run(tmp_path, monkeypatch):
         sound = (run / file).read_text()
         (run / file).write_text(sound + damage)
         with pytest.raises(ConfigError) as error:
-            experiments.keep("pearl")
+            experiments.keep(run, kept, words)
         assert file in error.value.cause
         (run / file).write_text(sound)
         assert read_evaluation(kept / "eval.json") and (kept / "metrics.csv").read_text() == thinned
