@@ -96,7 +96,7 @@ def test_encoder_gets_exactly_no_gradient_from_actor_and_alpha(routed):
     r = routed
 
     def actor_of(encoder):
-        zc, _ = r.objectives.infer(encoder, r.data)
+        zc = r.objectives.infer(encoder, r.data).zc
         return r.objectives.actor(ActorSide(r.actor, None), r.critic, zc, r.log_alpha, r.data)
 
     def alpha_loss(encoder):

@@ -54,6 +54,21 @@ class Minibatch(NamedTuple):
     z_noise: jax.Array | None = None
 
 
+class Inferred(NamedTuple):
+    """What the encoder makes of a minibatch.
+
+    Attributes:
+        zc: conditioning (task, conditioning).
+        kl: nats (task, latent); None without an information bottleneck.
+        experience: posterior mean of the whole context without its sentence (task, latent); None
+            unless `encoder.aux` is contrastive.
+    """
+
+    zc: jax.Array
+    kl: jax.Array | None = None
+    experience: jax.Array | None = None
+
+
 class CriticSide(NamedTuple):
     """Parameters trained by the critic objective; no encoder: None."""
 
@@ -106,20 +121,26 @@ class Objectives:
         self.is_categorical = config.model.critic == "c51"
         self.support = losses.critic_support(config.model.critic_v_max, config.model.critic_bins)
 
-    def infer(
-        self, encoder_params: Params | None, data: Minibatch
-    ) -> tuple[jax.Array, jax.Array | None]:
-        """Conditioning zc (task, conditioning) and KL nats (task, latent), or None for these."""
+    def infer(self, encoder_params: Params | None, data: Minibatch) -> Inferred:
         if self.inference is None or data.z_noise is None:
             if self.config.model.conditioning == "task_id":
-                return jax.nn.one_hot(data.task_ids, self.networks.conditioning_size), None
-            return jnp.zeros((data.task_ids.shape[0], 0)), None
+                return Inferred(jax.nn.one_hot(data.task_ids, self.networks.conditioning_size))
+            return Inferred(jnp.zeros((data.task_ids.shape[0], 0)))
+        experience, mask, goal_mask = None, data.context_mask, data.goal_mask
+        both = self.config.encoder.aux == "contrastive"
+        if both:  # in one pass: they read the same transitions
+            assert mask is not None and goal_mask is not None
+            mask = jnp.stack([mask, jnp.ones_like(mask)])
+            goal_mask = jnp.stack([goal_mask, jnp.zeros_like(goal_mask)])
         posterior = self.inference.posterior(
-            encoder_params, data.context, data.context_mask, data.goal, data.goal_mask
+            encoder_params, data.context, mask, data.goal, goal_mask
         )
+        if both:
+            experience = posterior.mean[1]
+            posterior = jax.tree.map(lambda x: x[0], posterior)
         has_kl = self.config.encoder.information_bottleneck
         kl = kl_to_standard_normal(posterior) if has_kl else None
-        return self.inference.z_of_noise(posterior, data.z_noise), kl
+        return Inferred(self.inference.z_of_noise(posterior, data.z_noise), kl, experience)
 
     def act(self, actor_params: Params, obs: jax.Array, zb: jax.Array, noise: jax.Array):
         mean, log_std, routing = self.networks.actor(actor_params, obs, zb[:, None])
@@ -149,25 +170,23 @@ class Objectives:
         next_value = losses.soft_value(next_head, next_log_prob, alpha)
         return losses.td_target(data.reward, data.discount, next_value), None
 
-    def auxiliary(self, encoder_params: Params, zc: jax.Array, data: Minibatch) -> jax.Array:
+    def auxiliary(self, encoder_params: Params, inferred: Inferred, data: Minibatch) -> jax.Array:
         if self.networks.reconstruct is not None:
             predicted = self.networks.reconstruct(
-                encoder_params, data.obs, data.action, zc[:, None]
+                encoder_params, data.obs, data.action, inferred.zc[:, None]
             )
             change = data.next_obs - data.obs
             return jnp.mean(losses.reconstruction_loss(predicted, data.reward, change))
-        assert self.inference is not None and data.context_mask is not None
-        goal, shown = data.goal, jnp.ones(data.task_ids.shape)
-        seen = jnp.ones_like(data.context_mask)
-        experience = self.inference.posterior(encoder_params, data.context, seen, goal, 0.0 * shown)
+        assert self.inference is not None and inferred.experience is not None
         nothing = init_belief(data.task_ids.shape, self.inference.latent_dim)
-        text = self.inference.posterior_of_belief(encoder_params, nothing, goal, shown)
-        return losses.contrastive_loss(experience.mean, text.mean, data.task_ids)
+        shown = jnp.ones(data.task_ids.shape)
+        text = self.inference.posterior_of_belief(encoder_params, nothing, data.goal, shown)
+        return losses.contrastive_loss(inferred.experience, text.mean, data.task_ids)
 
     def critic(self, trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
         """Loss, (zc, metrics); `target_params` are the target critics' or the V network's."""
         config = self.config
-        zc, kl = self.infer(trained.encoder, data)
+        zc, kl, _ = inferred = self.infer(trained.encoder, data)
         alpha = jnp.exp(log_alpha)[data.task_ids]
         zb = stop_gradient(zc)  # the target is stopped as a whole; this spares tracing its tangents
         target, clipped = self.critic_target(actor_params, target_params, alpha, zb, data)
@@ -181,7 +200,7 @@ class Objectives:
         if clipped is not None:
             metrics["clipped_target_fraction"] = clipped
         if config.encoder.aux != "none":
-            metrics["aux_loss"] = self.auxiliary(trained.encoder, zc, data)
+            metrics["aux_loss"] = self.auxiliary(trained.encoder, inferred, data)
             loss = loss + config.encoder.aux_weight * metrics["aux_loss"]
         if kl is not None:
             kl_loss = losses.kl_loss(kl, config.kl.reduce, config.kl.free_bits)
