@@ -77,10 +77,18 @@ TOY = Size(
 
 
 class Lines:
-    """Rows as lines of JSON on standard output, for the process that began this one."""
+    """Rows as lines of JSON on standard output, for the process that began this one.
+
+    Args:
+        labels: of every row.
+    """
+
+    def __init__(self, **labels: Any):
+        self.labels = labels
 
     def add(self, name: str, value: float, unit: str, **labels: Any) -> None:
-        print(json.dumps({"name": name, "value": value, "unit": unit} | labels), flush=True)
+        row = {"name": name, "value": value, "unit": unit} | self.labels | labels
+        print(json.dumps(row), flush=True)
 
 
 class Watch(cj.Logger):
@@ -159,10 +167,10 @@ def physics(size: Size, began: float) -> None:
     bench_backend("mjx", size.lanes, Lines())
 
 
-def learner(config_file: str) -> None:
+def learner(config_file: str, autotune: bool = True) -> None:
     from cmrl_jax.bench.main import bench_learner
 
-    bench_learner(cj.load_config(config_file), Lines())
+    bench_learner(cj.load_config(config_file), Lines(autotune=autotune))
 
 
 def workers(size: Size, began: float) -> None:
@@ -177,13 +185,17 @@ def naive(size: Size, began: float) -> None:
     bench_naive(Lines())
 
 
-# Name -> what it does, and the seconds that it may take at most.
 def play(name: str, size: Size, began: float) -> None:
     """A part, in the process that is its own."""
+    if name.endswith(UNTUNED):  # read once, when jax looks for its device
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {NO_AUTOTUNING}"
     prepare_jax(cj.load_config(size.main))  # its precision holds for what builds no run, too
     PARTS[name][0](size, began)
 
 
+UNTUNED = "-untuned"  # what trying kernels for each product is worth, and what it costs
+NO_AUTOTUNING = "--xla_gpu_autotune_level=0"
+# Name -> what it does, and the seconds that it may take at most.
 PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
     "device": (device, 60),
     "main": (lambda s, t: learn("main", s.main, s, 1, t), 300),
@@ -194,6 +206,8 @@ PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
     "native-workers": (workers, 120),
     "large": (lambda s, t: learn("large", s.large, s, 1, t), 900),
     "large-learner": (lambda s, t: learner(s.large), 300),
+    f"large-learner{UNTUNED}": (lambda s, t: learner(s.large, autotune=False), 300),
+    f"learner{UNTUNED}": (lambda s, t: learner(s.main, autotune=False), 120),
     "naive": (naive, 300),
 }
 

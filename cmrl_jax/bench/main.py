@@ -70,8 +70,11 @@ class Report:
         print(f"{name:<30} {value:>10.1f} {unit:<8} {shown}", flush=True)
 
 
-def bench_learner(config: Config, report: Report) -> None:
-    """Gradient steps a second on rings full of random transitions."""
+def bench_learner(config: Config, report: bench_physics.Report) -> None:
+    """Gradient steps a second on rings full of random transitions, and what compiling them took.
+
+    That is short where the cache of compiled programs has them.
+    """
     session = Session(config)
     learner, env = session.algorithm.parts, session.env
     run = jit_once(session.algorithm.init)(jax.random.key(0))
@@ -95,10 +98,14 @@ def bench_learner(config: Config, report: Report) -> None:
         keys = jax.random.split(key, GRADIENT_STEPS)
         return learner.updates(state, replay, context, keys)[0]
 
-    compiled = jit_repeated(updates).lower(run.learner, jax.random.key(2)).compile()
+    lowered = jit_repeated(updates).lower(run.learner, jax.random.key(2))
+    started = time.perf_counter()
+    compiled = lowered.compile()
+    compile_s = time.perf_counter() - started
     seconds = best_seconds(lambda: compiled(run.learner, jax.random.key(2)))
     shape = f"{len(config.tasks.train)}x{config.sac.batch}"
     report.add("learner/gradient_steps_per_s", GRADIENT_STEPS / seconds, "1/s", batch=shape)
+    report.add("learner/compile_s", compile_s, "s", batch=shape)
 
 
 def bench_start(config: Config, report: Report) -> None:

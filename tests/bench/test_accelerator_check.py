@@ -44,7 +44,9 @@ def test_every_part_ends_and_leaves_its_figures(check):
     # What was compiled for the first is there for the second.
     assert figures["main-again/first_iteration_s"] < figures["main/first_iteration_s"]
     assert figures["mjx/control_steps_per_s"] > 0
-    assert figures["learner/gradient_steps_per_s"] > 0
+    rates = [r for r in document["rows"] if r["name"] == "learner/gradient_steps_per_s"]
+    assert [r["autotune"] for r in rates] == [True, True, False, False]
+    assert all(r["value"] > 0 for r in rates)
     workers = [r["workers"] for r in document["rows"] if r["name"].startswith("native_workers/")]
     assert workers[:2] == [1, 2]
 

@@ -344,8 +344,8 @@ def test_own_episodes_change_what_is_adapted(restored, adapt):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("view", [0, 5])  # as it is, and a quarter turn
-def test_after_a_search_it_begins_where_the_winner_plays(restored, view):
+@pytest.mark.parametrize("arm", [16, 53])  # the first task's z as it is; a quarter turn, reach 1
+def test_after_a_search_it_begins_where_the_winner_plays(restored, arm):
     """Before any gradient its read-out is the arm's own score in the evaluation of every arm."""
     config, trained, text, placements = restored
     session = Session(config)
@@ -355,15 +355,15 @@ def test_after_a_search_it_begins_where_the_winner_plays(restored, view):
     actor, encoder = trained.acting
     params = PolicyParams(actor, encoder, trained.obs_stats, task_z)
     agent = session.agent_of("arms")
-    arm = 2 * len(session.env.symmetries[0]) + view
+    reach, z, view = agent.parts(arm)
+    assert (z, agent.views) == (2, 8) and (reach, view) in ((0, 0), (1, 5))
     shown = np.broadcast_to(text, (1, 1, len(placements), len(text)))
     trial = Trial(("window-close",), placements[None], shown)
     evaluator = Evaluator(config, session.env, agent, len(placements))
     wanted = evaluator.run([params], trial, (arm,), seed=0)[arm]
-    of_obs, of_action = (matrices[view] for matrices in session.env.symmetries)
     options = FinetuneOptions("window-close", episodes=21)
     tuned = finetune_config(config, options.task, "search", options.episodes, 1, 1.0)
-    winner = Winner(jnp.asarray(task_z[1]), of_obs, of_action)
+    winner = Winner(jnp.asarray(task_z[1]), *agent.matrices(arm))
     tuning = FineTuning(tuned, "search", trained, text, options, winner)
     found = tuning.read_out(placements, seed=0)
     np.testing.assert_allclose(found.returns, wanted.returns.mean(), rtol=1e-4)
