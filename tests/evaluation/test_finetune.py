@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -354,7 +355,7 @@ def test_after_a_search_it_begins_where_the_winner_plays(restored, arm):
     task_z = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     actor, encoder = trained.acting
     params = PolicyParams(actor, encoder, trained.obs_stats, task_z)
-    agent = session.agent_of("arms")
+    agent: Any = session.agent_of("arms")
     reach, z, view = agent.parts(arm)
     assert (z, agent.views) == (2, 8) and (reach, view) in ((0, 0), (1, 5))
     shown = np.broadcast_to(text, (1, 1, len(placements), len(text)))
