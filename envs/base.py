@@ -55,8 +55,9 @@ class MetaEnv(Protocol):
             observation_size) and actions (symmetry, action_size, action_size) are multiplied by
             where the scene is seen mirrored or turned, the identity first.
         reaches: matrices that observations (reach, observation_size, observation_size) are
-            multiplied by where an object is seen to have moved less or more far than it has, the
-            identity first. A policy that stops where the object was to go then takes it elsewhere.
+            multiplied by to show an object at another part of the way that it has moved, the
+            identity first: a policy that stops where it was taught to then pushes on, or stops
+            earlier.
     """
 
     observation_size: int

@@ -38,7 +38,7 @@ PLANE_SYMMETRIES = np.array(
     ],
     np.float32,
 )
-REACHES = (1.0, 0.7)  # how far an object is seen to have moved, of how far it has
+REACHES = (1.0, 0.7)  # parts of an object's way at which it is shown; drawer and window have stops
 OBS_MODES = ("metaworld", "canonical")
 
 
@@ -211,10 +211,10 @@ class Ml4Env:
 
     @property
     def reaches(self) -> np.ndarray:
-        """As it is, then the object's movement as `REACHES` times what it is, and the hand with it.
+        """As it is, then with the object shown at `REACHES` of its way.
 
-        The hand is moved with the object, so that what it does there looks the same. Only canonical
-        observations show how far an object has moved; others have the identity alone.
+        The hand is shown moved by as much, so that what it does at the object looks the same. Only
+        canonical observations show how far an object has moved; others have the identity alone.
         """
         seen = REACHES if self.obs_mode == "canonical" else REACHES[:1]
         matrices = np.tile(np.eye(OBS_SIZE, dtype=np.float32), (len(seen), 1, 1))

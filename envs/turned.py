@@ -1,4 +1,4 @@
-"""An environment as an agent sees it that has chosen how: mirrored, turned, moved more or less."""
+"""An environment as it is seen by an arm of a search: mirrored, turned, its object held back."""
 
 from __future__ import annotations
 

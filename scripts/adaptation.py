@@ -66,7 +66,7 @@ EVALUATIONS = {  # flags of `eval`; native physics unless they say otherwise
     "search-goal": f"--adapt search {_K}",
     "posterior-task": f"{_K} {_TASK}",
     "posterior-goal": f"{_K}",
-    "arms": "--adapt arms --k " + ",".join(map(str, range(32))),  # four z in eight views
+    "arms": "--adapt arms --k " + ",".join(map(str, range(32))),  # four z, eight views; reach 1
     "text-shuffled": "--k 0 --text-control shuffled",
     "text-zero": "--k 0 --text-control zero",
     "trained": "--k 0",
@@ -100,13 +100,17 @@ def parts(name: str) -> tuple[str, str, int]:
     return kind, fold, int(seed)
 
 
-def train_command(name: str) -> list[str]:
-    """What a user would type for a run."""
+def typed(name: str) -> list[str]:
+    """What a user types to begin a run."""
     kind, fold, seed = parts(name)
     train = ",".join(task for task in TASKS if task != fold)
     words = ["train.py", *shlex.split(KINDS[kind]), "--tasks.train", train, "--tasks.test", fold]
-    words += ["--env.physics", "native", "--seed", str(seed), "--run", str(RUNS / name)]
-    return words + (["--resume"] if (RUNS / name / "config.yaml").exists() else [])
+    return [*words, "--env.physics", "native", "--seed", str(seed), "--run", str(RUNS / name)]
+
+
+def train_command(name: str) -> list[str]:
+    """The same, or what goes on with a run that is there."""
+    return typed(name) + (["--resume"] if (RUNS / name / "config.yaml").exists() else [])
 
 
 def evaluations_of(name: str) -> list[str]:
@@ -135,15 +139,15 @@ def score_command(name: str, evaluation: str) -> list[str]:
 def keep(name: str) -> None:
     """Copies what scoring needs of a finished run: the policy saved last and its facts."""
     run, kept = RUNS / name, POLICIES / name
+    if parts(name)[0] in META_RL:  # first: what a policy is there of is not kept again
+        experiments.keep(run, RESULTS / "curves" / name, typed(name))
     last = max(int(path.name) for path in (run / "policy").iterdir() if path.name.isdigit())
     shutil.rmtree(kept, ignore_errors=True)
     pack(run / "policy" / str(last), kept / "policy" / f"{last}.zip")
     for file in ("config.yaml", "versions.json"):
         shutil.copy(run / file, kept / file)
-    spoken = f"python {shlex.join(train_command(name)).removesuffix(' --resume')}\n"
+    spoken = f"python {shlex.join(typed(name))}\n"
     (kept / "command.txt").write_text(spoken, encoding="utf-8")
-    if parts(name)[0] in META_RL:
-        experiments.keep(run, RESULTS / "curves" / name, train_command(name))
 
 
 def train(names: list[str]) -> int:
@@ -431,7 +435,7 @@ STEPS = {"train": train, "score": score, "finetune": finetune, "table": table}
 def main(words: list[str]) -> int:
     if "--list" in words:
         for name in runs():
-            print(f"python {shlex.join(train_command(name))}")
+            print(f"python {shlex.join(typed(name))}")
             tuned = [FINETUNE] if is_finetuned(name) else []
             for evaluation in evaluations_of(name) + tuned:
                 print(f"python {shlex.join(score_command(name, evaluation))}")

@@ -86,18 +86,21 @@ EXPERIMENTS = {
 }
 
 
+def typed(name: str) -> list[str]:
+    """What a user types to begin a run."""
+    return ["train.py", *shlex.split(EXPERIMENTS[name]), "--run", str(RUNS / name)]
+
+
 def command(name: str) -> list[str]:
-    """What a user would type for a run."""
-    run = RUNS / name
-    words = ["train.py", *shlex.split(EXPERIMENTS[name]), "--run", str(run)]
-    return words + (["--resume"] if (run / "config.yaml").exists() else [])
+    """The same, or what goes on with a run that is there."""
+    return typed(name) + (["--resume"] if (RUNS / name / "config.yaml").exists() else [])
 
 
 def keep(run: Path, kept: Path, words: list[str]) -> None:
     """Copies what results/ keeps of a finished run; the metrics thinned to `CSV_ROWS` rows.
 
     Args:
-        words: what a user would type for the run.
+        words: what a user types to begin it.
     """
     # Read first: a damaged file does not take the place of the one that is kept.
     header, by_line = read_csv(run / METRICS, "put it back from a copy, or run the experiment anew")
@@ -117,8 +120,7 @@ def keep(run: Path, kept: Path, words: list[str]) -> None:
     ]
     with (kept / METRICS).open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([header, *thinned])
-    spoken = f"python {shlex.join(words).removesuffix(' --resume')}\n"
-    (kept / "command.txt").write_text(spoken, encoding="utf-8")
+    (kept / "command.txt").write_text(f"python {shlex.join(words)}\n", encoding="utf-8")
 
 
 def refused(cause: str, cure: str) -> int:
@@ -129,7 +131,7 @@ def refused(cause: str, cure: str) -> int:
 
 def main(words: list[str]) -> int:
     if "--list" in words:
-        print("\n".join(f"{name}: python {shlex.join(command(name))}" for name in EXPERIMENTS))
+        print("\n".join(f"{name}: python {shlex.join(typed(name))}" for name in EXPERIMENTS))
         return 0
     unknown = [word for word in words if word not in EXPERIMENTS]
     if unknown:
@@ -140,7 +142,7 @@ def main(words: list[str]) -> int:
             code = subprocess.run([sys.executable, *command(name)], cwd=ROOT).returncode
             if code or not (RUNS / name / EVALUATION).exists():
                 return code or 1  # stopped: the next call goes on with it
-        keep(RUNS / name, RESULTS / name, command(name))
+        keep(RUNS / name, RESULTS / name, typed(name))
     return 0
 
 

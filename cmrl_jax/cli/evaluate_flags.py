@@ -74,8 +74,8 @@ def _parser(command: str, description: str) -> argparse.ArgumentParser:
         default="posterior",
         metavar="A",
         choices=ADAPT,
-        help="what own episodes change: posterior: the belief over z; search: which z and which "
-        "mirror of the scene is acted on; arms: a control, the k-th of those [posterior]",
+        help="what own episodes change: posterior: the belief over z; search: which z is "
+        "acted on, and how the scene is seen; arms: a control, the k-th of those [posterior]",
     )
     add(
         "--protocol",

@@ -121,6 +121,7 @@ class Evaluator:
         self.horizon = horizon or config.env.horizon
         self._train_tasks, self._env, self._agent = config.tasks.train, env, agent
         self._episode = jit_repeated(make_episode(env, agent, self.horizon))
+        self._lowered: Any = None
         self._compiled: Any = None
 
     @property
@@ -130,7 +131,12 @@ class Evaluator:
     def compile(self, params: Any, text_width: int) -> None:
         """Compiles the episode for one policy's parameters, or their shapes; later calls do not."""
         if self._compiled is None:
-            self._compiled = self.traced(params, text_width).lower().compile()
+            self.lower(params, text_width)
+            self._compiled, self._lowered = self._lowered.compile(), None
+
+    def lower(self, params: Any, text_width: int) -> None:
+        """All of a compile that reads jax's settings, which are each thread's own."""
+        self._lowered = self._lowered or self.traced(params, text_width).lower()
 
     def traced(self, params: Any, text_width: int) -> Any:
         """The episode as jax traces it for one policy's parameters, or their shapes."""

@@ -237,26 +237,30 @@ class _Training:
                 metas[i] = found.meta
         return state, metas
 
-    def compile_programs(self) -> None:
-        """What is not compiled yet of what training needs."""
-        programs: dict[str, tuple[Any, Callable[[], Any]]] = {
-            "the training iteration": (self.program, self.program.compile),
-            "the evaluation episode": (self.evaluator, self.compile_evaluation),
-        }
-        self.timed({name: go for name, (it, go) in programs.items() if not it.is_compiled})
+    def compile_programs(self, training: bool = True) -> None:
+        """Compiles what is not compiled yet, the two programs side by side, and says how long each
+        took: XLA keeps little more than one core busy with each, outside Python's lock.
 
-    def compile_evaluation(self) -> None:
+        Args:
+            training: the iteration too, not the evaluation alone.
+        """
         params = jax.eval_shape(self.algorithm.policy_params, self.program.one)
-        self.evaluator.compile(params, self.session.goals.vectors.shape[-1])
-
-    def timed(self, programs: dict[str, Callable[[], Any]]) -> None:
-        """Compiles programs side by side, and says how long each took: XLA keeps little more than
-        one core busy with each, and works outside Python's lock."""
+        text_width = self.session.goals.vectors.shape[-1]
+        programs: dict[str, tuple[Any, tuple[Any, ...]]] = {
+            "the training iteration": (self.program, ()),
+            "the evaluation episode": (self.evaluator, (params, text_width)),
+        }
+        if not training:
+            del programs["the training iteration"]
+        left = {name: x for name, x in programs.items() if not x[0].is_compiled}
+        if not left:
+            return
         started = time.monotonic()
-        with ThreadPoolExecutor(max(len(programs), 1)) as pool:
-            pending = {pool.submit(compile): name for name, compile in programs.items()}
-            if programs:
-                self.say(f"compiling {' and '.join(programs)} ...")
+        self.say(f"compiling {' and '.join(left)} ...")
+        for program, arguments in left.values():
+            program.lower(*arguments)
+        with ThreadPoolExecutor(len(left)) as pool:  # its end waits for both, should one fail
+            pending = {pool.submit(x.compile, *arguments): n for n, (x, arguments) in left.items()}
             for one in as_completed(pending):
                 one.result()
                 self.say(f"compiling {pending[one]} took {time.monotonic() - started:.1f} s")
@@ -356,8 +360,7 @@ class _Training:
         act = self.algorithm.policy_params
         policies = [parallel.on_one_device(act(state)) for state in states]
         trial = self.session.trial(self.config.eval.goal_set, goals)
-        if not self.evaluator.is_compiled:
-            self.timed({"the evaluation episode": self.compile_evaluation})
+        self.compile_programs(training=False)
         scores = self.evaluator.run(policies, trial, k, self.config.eval.seed, check)
         return [summarise(of_policy(scores, i), trial.tasks) for i in range(len(policies))]
 

@@ -31,7 +31,7 @@ from cmrl_jax.algorithms.cmrl.objectives import ActorSide, CriticSide, Minibatch
 from cmrl_jax.algorithms.cmrl.train_state import PACKED, STACKED, Acting, pack, unpack
 from cmrl_jax.algorithms.common import replay
 from cmrl_jax.jax_runtime import jit_once
-from cmrl_jax.nn.distributions import sample_tanh_gaussian
+from cmrl_jax.nn.distributions import kl_to_standard_normal, sample_tanh_gaussian
 from cmrl_jax.nn.networks import Routing
 from cmrl_jax.nn.optimizers import adam_step, clip_by_norm, init_adam, ravel, unravel
 
@@ -344,6 +344,31 @@ def test_routing_health_matches_loops():
                 gap = np.abs(rows[i].mean(0) - rows[j].mean(0))
                 total, pairs = total + np.mean(0.5 * np.sum(gap, -1)), pairs + 1
     np.testing.assert_allclose(distance, total / pairs, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "encoder",
+    [{"goal_fusion": "factor"}, {"goal_fusion": "both"}, {"information_bottleneck": False}],
+)
+def test_both_posteriors_of_a_step_come_of_one_pass(ring, encoder):
+    """What is acted on, and the whole experience without its sentence: as each by itself."""
+    made = build(tiny_config(encoder={"aux": "contrastive", **encoder}))
+    learner, state = made.learner, made.state
+    data = learner.draw_minibatch(state, ring, ring, jax.random.key(3))
+    partial = jnp.ones_like(data.context_mask).at[0, 1:].set(0).at[1].set(0)
+    data = data._replace(context_mask=partial, goal_mask=jnp.array([1.0, 1.0, 0.0]))
+    params = spread(state.encoder_params)
+    found = jax.jit(learner.objectives.infer)(params, data)
+    posterior = jax.jit(learner.inference.posterior)
+    own = posterior(params, data.context, partial, data.goal, data.goal_mask)
+    np.testing.assert_allclose(
+        found.zc, learner.inference.z_of_noise(own, data.z_noise), rtol=1e-4, atol=1e-6
+    )
+    if found.kl is not None:
+        np.testing.assert_allclose(found.kl, kl_to_standard_normal(own), rtol=1e-4, atol=1e-6)
+    alone = posterior(params, data.context, jnp.ones_like(partial), data.goal, jnp.zeros(TASKS))
+    np.testing.assert_allclose(found.experience, alone.mean, rtol=1e-4, atol=1e-6)
+    assert np.abs(np.asarray(found.experience - own.mean)).max() > 1e-3
 
 
 @pytest.mark.slow

@@ -112,8 +112,9 @@ def test_the_own_z_is_tried_first_and_says_in_which_views_the_others_are(made, p
 
 
 def test_the_best_arm_is_tried_with_every_other_reach(made, params):
-    """Lane l's best z and view is 5 + l; it earns most with the last reach."""
-    value = lambda lane, arm: constant(lane, arm % ARMS) + 0.1 * (arm // ARMS)
+    """Lane l's best z and view is 5 + l; it earns most with the last reach, in lane 1 the first."""
+    sign = [1, -1, 1]
+    value = lambda lane, arm: constant(lane, arm % ARMS) + 0.1 * sign[lane] * (arm // ARMS)
     trial = Trial(made, params, value, REACHES)
     tried = np.stack([trial.play() for _ in range(BUDGET)])
     best = 5 + np.arange(LANES)
@@ -121,9 +122,10 @@ def test_the_best_arm_is_tried_with_every_other_reach(made, params):
     assert begin is not None and begin > ARMS and (tried[:begin] < ARMS).all()
     np.testing.assert_array_equal(tried[begin : begin + 2], [ARMS + best, 2 * ARMS + best])
     # After it the best arms again, whatever their reach.
-    assert (tried[begin + 2] == 2 * ARMS + best).all()
-    assert (trial.play(exploit=True) == 2 * ARMS + best).all()
-    assert trial.agent.describe(trial.memory)[0].endswith(", reach 2 of 2")
+    won = best + np.array([2, 0, 2]) * ARMS
+    assert (tried[begin + 2] == won).all()
+    assert (trial.play(exploit=True) == won).all()
+    assert trial.agent.describe(trial.memory)[0].endswith(", reach 2")
 
 
 def test_rounds_end_with_the_budget_and_halve_what_is_left():

@@ -179,7 +179,7 @@ def test_results_keep_no_damaged_run(tmp_path, monkeypatch):
     """scripts/experiments.py replaces nothing before it has read what it copies."""
     monkeypatch.syspath_prepend(ROOT)
     experiments = importlib.import_module("scripts.experiments")
-    kept, words = tmp_path / "kept", ["train.py", "--config", "pearl.yaml", "--resume"]
+    kept, words = tmp_path / "kept", ["train.py", "--config", "pearl.yaml"]
     header, *rows = CSV.splitlines()
     many = [header, rows[1], *[f"{n},{n}00,0.5," for n in range(3, 300)]]
     run = write_run(tmp_path / "run", "\n".join(many) + "\n", {0: 0.2})

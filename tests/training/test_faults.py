@@ -75,7 +75,7 @@ def test_sigint_saves_and_resume_goes_on(undisturbed, tmp_path):
 
 
 def test_a_second_signal_stops_at_once_even_in_a_compile(tmp_path):
-    """The main thread is inside one long call, where Python's own handlers would not run."""
+    """XLA's threads are busy, and nobody waits for them."""
     run = tmp_path / "run"
     lines = []
     with start(run, *native(), JAX_ENABLE_COMPILATION_CACHE="false") as process:

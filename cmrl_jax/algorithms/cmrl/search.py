@@ -2,13 +2,13 @@
 
 An arm is a z, a view (`MetaEnv.symmetries`) and a reach (`MetaEnv.reaches`): the z of the task's
 own sentence (the prior's mean without text) or that of a training task, acting in the scene as it
-is seen mirrored or turned, and with the object moved less or more far than it is. Exploring
-episodes try the task's own z in every view, then the training tasks' in the best of those, then the
-best arms again by successive halving (Karnin et al. 2013: sequential halving), among them the best
-arm with every other reach. A counted episode takes the best arm so far and teaches nothing. Arms
-are judged by rewards alone: the return, and as much again for the best few steps, since waiting at
-an object can pay as much as moving it late. Everything is data in the compiled episode, so one
-program plays any budget.
+is seen mirrored or turned, and with the object shown at a part of the way that it has moved, so
+that the policy pushes on. Exploring episodes try the task's own z in every view, then the training
+tasks' in the best of those, then the best arms again by successive halving (Karnin et al. 2013:
+sequential halving), among them the best arm with every other reach. A counted episode takes the
+best arm so far and teaches nothing. Arms are judged by rewards alone: the return, and as much again
+for the best few steps, since waiting at an object can pay as much as moving it late. Everything is
+data in the compiled episode, so one program plays any budget.
 """
 
 from __future__ import annotations
@@ -67,10 +67,12 @@ class Rounds(NamedTuple):
     Attributes:
         views: of the best ones, in which the training tasks' z are tried.
         starts: after how many episodes each round begins, ascending from 0: the own z in every
-            view, the training tasks' in `views` of them, then rounds of the best arms so far, each
-            half of what is left and at most half of the arms tried; the last is the end.
-        reaching: after how many the best arm's other reaches are tried, a round of its own after
-            the first of the best arms; None where there are none.
+            view; the training tasks' in `views` of them; then rounds of the best arms so far, each
+            half of what is left and at most half of the arms tried, and after the first of them
+            that of the reaches. The last is the end: of the budget, or of the second round where
+            that is later.
+        reaching: where the round of the best arm's other reaches begins; None where there are none,
+            or no room for them.
     """
 
     views: int
@@ -79,16 +81,22 @@ class Rounds(NamedTuple):
 
 
 def rounds_of(views: int, tasks: int, reaches: int = 1, budget: int = BUDGET) -> Rounds:
-    """The rounds for a number of views, training tasks and reaches; half of what the views leave is
-    kept for those after the second."""
+    """The rounds for a number of views, training tasks and reaches.
+
+    The training tasks' z get half of the episodes that the own z leaves, but one view at least.
+    """
     kept = max(1, min(views, (budget - views) // 2 // tasks))
-    tried, reaching = views + kept * tasks, None
-    starts = [0, views, tried]
-    while (done := starts[-1]) < budget:
-        starts.append(done + max(1, min((budget - done) // 2, tried // 2)))
-        if reaching is None and 1 < reaches <= budget - starts[-1] + 1:
-            reaching = starts[-1]
-            starts.append(reaching + reaches - 1)
+    tried = views + kept * tasks
+
+    def after_next(done: int) -> int:
+        return done + max(1, min((budget - done) // 2, tried // 2))
+
+    starts, reaching = [0, views, tried], None
+    if tried < budget and 1 < reaches <= budget - after_next(tried) + 1:
+        reaching = after_next(tried)
+        starts += [reaching, reaching + reaches - 1]
+    while starts[-1] < budget:
+        starts.append(after_next(starts[-1]))
     return Rounds(kept, tuple(starts), reaching)
 
 
@@ -133,8 +141,15 @@ class SearchAgent:
 
     def matrices(self, arm: int) -> tuple[np.ndarray, np.ndarray]:
         """What an arm multiplies observations by, and what undoes it for actions (transposed)."""
-        (of_obs, of_action), (reach, _, view) = self.symmetries, self.parts(arm)
-        return self.reaches[reach] @ of_obs[view], of_action[view]
+        of_obs, of_action = self._seen
+        reach, _, view = self.parts(arm)
+        return of_obs[reach, view], of_action[view]
+
+    @property
+    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Matrices of observations (reach, view, ...) and of actions (view, ...)."""
+        of_obs, of_action = self.symmetries
+        return self.reaches[:, None] @ of_obs, of_action
 
     def init(self, told: Told) -> SearchMemory:
         lead, inference = told.task_row.shape, self._inference
@@ -183,12 +198,12 @@ class SearchAgent:
         deterministic: Any,
     ) -> jax.Array:
         reach, _, view = self.parts(memory.arm)
-        of_obs, of_action = (jnp.asarray(matrix)[view] for matrix in self.symmetries)
-        turned = jnp.einsum("...ij,...j->...i", of_obs, obs)
+        of_obs, of_action = map(jnp.asarray, self._seen)
+        of_obs, of_action = of_obs[reach, view], of_action[view]
         seen, _ = self.learner.policy(
             params.actor_params,
             params.obs_stats,
-            jnp.einsum("...ij,...j->...i", jnp.asarray(self.reaches)[reach], turned),
+            jnp.einsum("...ij,...j->...i", of_obs, obs),
             memory.z,
             None,
             deterministic,
@@ -218,7 +233,7 @@ class SearchAgent:
         for arm in np.asarray(memory.arm):
             reach, z, view = self.parts(int(arm))
             seen = f", view {view} of {self.views - 1}" if view else ""
-            seen += f", reach {reach} of {len(self.reaches) - 1}" if reach else ""
+            seen += f", reach {reach}" if reach else ""
             words.append(names[z] + seen)
         return words
 
@@ -245,9 +260,8 @@ class SearchAgent:
         return self._padded(arms.reshape(*arms.shape[:-2], -1))
 
     def _other_reaches(self, ranked: jax.Array) -> jax.Array:
-        """The best arm with every reach but the identity; the rest is not tried."""
-        best = ranked[..., :1] % self._of_reach
-        return self._padded(best + self._of_reach * np.arange(1, len(self.reaches)))
+        """The best arm, which has the first reach as all before, with each other one."""
+        return self._padded(ranked[..., :1] + self._of_reach * np.arange(1, len(self.reaches)))
 
     def _padded(self, arms: Any) -> jax.Array:
         rest = [(0, 0)] * (arms.ndim - 1) + [(0, self.arms - arms.shape[-1])]
