@@ -4,6 +4,9 @@ import importlib
 import json
 
 import pytest
+from run_file_helpers import write_run
+
+from cmrl_jax.config.schema import ConfigError
 
 NAME = "cmrl-window-open-s3"
 
@@ -83,3 +86,25 @@ def test_every_run_is_told_what_is_held_out(table):
         assert sorted([*train, fold]) == sorted(table.TASKS) and len(set(train)) == 3
         assert words[words.index("--seed") + 1] == str(seed)
     assert len(set(table.runs())) == len(table.KINDS) * len(table.TASKS) * len(table.SEEDS)
+
+
+def test_a_damaged_run_is_kept_whole_or_not_at_all(table, tmp_path, monkeypatch):
+    """What has a policy in results/ is not kept again: its learning curves come first."""
+    for name in ("RUNS", "POLICIES"):
+        monkeypatch.setattr(table, name, tmp_path / name)
+    name = "rl2-window-close-s0"
+    run = write_run(tmp_path / "RUNS" / name, by_k={0: 0.2})
+    (run / "versions.json").write_text("{}")
+    (run / "policy" / "7").mkdir(parents=True)
+    (run / "policy" / "7" / "data").write_text("weights")
+    sound = (run / "metrics.csv").read_text()
+    (run / "metrics.csv").write_text(sound + "1,2\n")
+    with pytest.raises(ConfigError):
+        table.train([name])
+    assert not (tmp_path / "POLICIES" / name).exists()
+    (run / "metrics.csv").write_text(sound)
+    assert table.train([name]) == 0
+    assert (tmp_path / "POLICIES" / name / "policy" / "7.zip").is_file()
+    assert (tmp_path / "curves" / name / "metrics.csv").read_text() == sound
+    spoken = (tmp_path / "curves" / name / "command.txt").read_text()
+    assert spoken.startswith("python train.py --config rl2.yaml") and "--resume" not in spoken
