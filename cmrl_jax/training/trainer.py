@@ -33,6 +33,7 @@ from cmrl_jax.training.logger import Logger, Progress
 from cmrl_jax.training.metrics import LEADING_COLUMNS, metric_names, metric_row
 from cmrl_jax.training.run import Run
 
+COMPILING = "a minute on a CPU, some on a GPU, seconds where they are cached"
 EVAL_FIGURES = ("success_any", "success_last", "return")
 
 
@@ -256,7 +257,7 @@ class _Training:
         if not left:
             return
         started = time.monotonic()
-        self.say(f"compiling {' and '.join(left)} ...")
+        self.say(f"compiling {' and '.join(left)} ({COMPILING}) ...")
         for program, arguments in left.values():
             program.lower(*arguments)
         with ThreadPoolExecutor(len(left)) as pool:  # its end waits for both, should one fail

@@ -32,6 +32,7 @@ from run_helpers import (
 
 from cmrl_jax.storage.checkpoint import full_store, policy_store
 from cmrl_jax.storage.run_dir import LOCK, writing_to
+from cmrl_jax.training.trainer import COMPILING
 from envs.physics.native import NativePhysics
 
 
@@ -86,7 +87,7 @@ def test_a_second_signal_stops_at_once_even_in_a_compile(tmp_path):
                 process.send_signal(signal.SIGTERM)
         assert process.wait() == 128 + signal.SIGTERM
     assert lines[-2:] == [
-        "compiling the training iteration and the evaluation episode ...\n",
+        f"compiling the training iteration and the evaluation episode ({COMPILING}) ...\n",
         "stopping at the end of this iteration; once more stops at once\n",
     ]
     assert steps(run) == [0]
