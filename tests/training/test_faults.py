@@ -30,6 +30,9 @@ from run_helpers import (
     steps,
 )
 
+from cmrl_jax.config.schema import ConfigError
+from cmrl_jax.evaluation.evaluator import Evaluator
+from cmrl_jax.evaluation.session import TrainingProgram
 from cmrl_jax.storage.checkpoint import full_store, policy_store
 from cmrl_jax.storage.run_dir import LOCK, writing_to
 from cmrl_jax.training.trainer import COMPILING
@@ -91,6 +94,21 @@ def test_a_second_signal_stops_at_once_even_in_a_compile(tmp_path):
         "stopping at the end of this iteration; once more stops at once\n",
     ]
     assert steps(run) == [0]
+
+
+def test_a_program_that_does_not_compile_ends_the_run_in_its_one_error(
+    stopped, tmp_path, monkeypatch
+):
+    """Compiles go on in threads, one for each program; the run is left as it was saved."""
+
+    def refuse(self, *args):
+        raise ConfigError("no memory is left", "give it less to do")
+
+    monkeypatch.setattr(Evaluator, "compile", refuse)
+    monkeypatch.setattr(TrainingProgram, "compile", lambda self: None)
+    # Of other sizes than any run of this process, so that nothing is compiled already.
+    cause, _ = stopped(tmp_path / "run", *native(), "--eval.goals", "3")
+    assert cause == "no memory is left" and steps(tmp_path / "run") == [0]
 
 
 def test_kill_9_in_a_save_leaves_the_checkpoint_before_and_no_lock(undisturbed, tmp_path):
