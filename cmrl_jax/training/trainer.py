@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +159,8 @@ class _Training:
         self.session, self.runs, self.stop = session, runs, stop
         self.algorithm, self.config = session.algorithm, session.config
         self.schedule = Schedule.of(self.config)
+        self.threads = ThreadPoolExecutor(1)
+        self.evaluation_compile: Future[None] | None = None
 
     def say(self, text: str) -> None:
         """A message about all runs."""
@@ -170,6 +172,7 @@ class _Training:
             return self.train(device, resume)
         finally:
             with contextlib.ExitStack() as left:
+                left.callback(self.threads.shutdown)  # last: a compile cannot be left
                 for run in reversed(self.runs):
                     left.callback(run.close)
 
@@ -178,7 +181,7 @@ class _Training:
         self.program = self.session.training(parallel.make_mesh(), len(self.runs))
         self.start(resume)
         if self.iterations_left() and not self.stop.requested:
-            self.compile_programs()
+            self.compile_iteration()
             self.iteration = self.program.compile()
         while self.iterations_left() and not self.stop.requested:
             self.step()
@@ -238,33 +241,37 @@ class _Training:
                 metas[i] = found.meta
         return state, metas
 
-    def compile_programs(self, training: bool = True) -> None:
-        """Compiles what is not compiled yet, the two programs side by side, and says how long each
-        took: XLA keeps little more than one core busy with each, outside Python's lock.
-
-        Args:
-            training: the iteration too, not the evaluation alone.
-        """
-        params = jax.eval_shape(self.algorithm.policy_params, self.program.one)
-        text_width = self.session.goals.vectors.shape[-1]
-        programs: dict[str, tuple[Any, tuple[Any, ...]]] = {
-            "the training iteration": (self.program, ()),
-            "the evaluation episode": (self.evaluator, (params, text_width)),
-        }
-        if not training:
-            del programs["the training iteration"]
-        left = {name: x for name, x in programs.items() if not x[0].is_compiled}
-        if not left:
+    def compile_iteration(self) -> None:
+        if self.program.is_compiled:
             return
         started = time.monotonic()
-        self.say(f"compiling {' and '.join(left)} ({COMPILING}) ...")
-        for program, arguments in left.values():
-            program.lower(*arguments)
-        with ThreadPoolExecutor(len(left)) as pool:  # its end waits for both, should one fail
-            pending = {pool.submit(x.compile, *arguments): n for n, (x, arguments) in left.items()}
-            for one in as_completed(pending):
-                one.result()
-                self.say(f"compiling {pending[one]} took {time.monotonic() - started:.1f} s")
+        self.say(f"compiling the training iteration ({COMPILING}) ...")
+        self.program.compile()
+        self.say(f"compiling the training iteration took {time.monotonic() - started:.1f} s")
+
+    def begin_evaluation_compile(self) -> None:
+        """Compiles the evaluation episode beside training, in a thread: XLA works outside Python's
+        lock. What reads jax's settings, each thread's own, is done here."""
+        if self.evaluation_compile or self.evaluator.is_compiled:
+            return
+        params = jax.eval_shape(self.algorithm.policy_params, self.program.one)
+        shapes = params, self.session.goals.vectors.shape[-1]
+        self.evaluator.lower(*shapes)
+        self.evaluation_compile = self.threads.submit(self.evaluator.compile, *shapes)
+
+    def end_evaluation_compile(self) -> None:
+        if self.evaluator.is_compiled:
+            return
+        self.begin_evaluation_compile()
+        assert self.evaluation_compile is not None
+        if not self.evaluation_compile.done():
+            started = time.monotonic()
+            self.say("compiling the evaluation episode ...")
+            wait([self.evaluation_compile])
+            self.say(
+                f"compiling the evaluation episode took {time.monotonic() - started:.1f} s more"
+            )
+        self.evaluation_compile.result()
 
     def iterations_left(self) -> bool:
         minutes, total = self.config.train.minutes, self.schedule.iterations
@@ -278,6 +285,7 @@ class _Training:
         # NaN on purpose; `check_health` does what JAX_DEBUG_NANS asks for.
         with jax.debug_nans(False), jax.debug_infs(False):
             self.state, metrics = self.iteration(self.state)
+        self.begin_evaluation_compile()  # while the iteration runs
         metrics = jax.tree.map(np.asarray, metrics)
         seconds = time.monotonic() - started
         self.done += 1
@@ -361,7 +369,7 @@ class _Training:
         act = self.algorithm.policy_params
         policies = [parallel.on_one_device(act(state)) for state in states]
         trial = self.session.trial(self.config.eval.goal_set, goals)
-        self.compile_programs(training=False)
+        self.end_evaluation_compile()
         scores = self.evaluator.run(policies, trial, k, self.config.eval.seed, check)
         return [summarise(of_policy(scores, i), trial.tasks) for i in range(len(policies))]
 

@@ -32,7 +32,6 @@ from run_helpers import (
 
 from cmrl_jax.config.schema import ConfigError
 from cmrl_jax.evaluation.evaluator import Evaluator
-from cmrl_jax.evaluation.session import TrainingProgram
 from cmrl_jax.storage.checkpoint import full_store, policy_store
 from cmrl_jax.storage.run_dir import LOCK, writing_to
 from cmrl_jax.training.trainer import COMPILING
@@ -90,7 +89,7 @@ def test_a_second_signal_stops_at_once_even_in_a_compile(tmp_path):
                 process.send_signal(signal.SIGTERM)
         assert process.wait() == 128 + signal.SIGTERM
     assert lines[-2:] == [
-        f"compiling the training iteration and the evaluation episode ({COMPILING}) ...\n",
+        f"compiling the training iteration ({COMPILING}) ...\n",
         "stopping at the end of this iteration; once more stops at once\n",
     ]
     assert steps(run) == [0]
@@ -99,16 +98,16 @@ def test_a_second_signal_stops_at_once_even_in_a_compile(tmp_path):
 def test_a_program_that_does_not_compile_ends_the_run_in_its_one_error(
     stopped, tmp_path, monkeypatch
 ):
-    """Compiles go on in threads, one for each program; the run is left as it was saved."""
+    """The evaluation's compile goes on in a thread; its error comes where it is waited for."""
 
     def refuse(self, *args):
         raise ConfigError("no memory is left", "give it less to do")
 
     monkeypatch.setattr(Evaluator, "compile", refuse)
-    monkeypatch.setattr(TrainingProgram, "compile", lambda self: None)
-    # Of other sizes than any run of this process, so that nothing is compiled already.
-    cause, _ = stopped(tmp_path / "run", *native(), "--eval.goals", "3")
-    assert cause == "no memory is left" and steps(tmp_path / "run") == [0]
+    # Of another size than any run of this process, so that it is not compiled already.
+    run = tmp_path / "run"
+    cause, _ = stopped(run, *native(), "--eval.goals", "3")
+    assert cause == "no memory is left" and len(rows_of(run)) < ITERATIONS
 
 
 def test_kill_9_in_a_save_leaves_the_checkpoint_before_and_no_lock(undisturbed, tmp_path):
