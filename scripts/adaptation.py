@@ -66,7 +66,7 @@ EVALUATIONS = {  # flags of `eval`; native physics unless they say otherwise
     "search-goal": f"--adapt search {_K}",
     "posterior-task": f"{_K} {_TASK}",
     "posterior-goal": f"{_K}",
-    "arms": "--adapt arms --k " + ",".join(map(str, range(32))),  # four z, eight views; reach 1
+    "arms": "--adapt arms --k " + ",".join(map(str, range(32))),  # four z, eight views, no reach
     "text-shuffled": "--k 0 --text-control shuffled",
     "text-zero": "--k 0 --text-control zero",
     "trained": "--k 0",

@@ -131,12 +131,13 @@ class Evaluator:
     def compile(self, params: Any, text_width: int) -> None:
         """Compiles the episode for one policy's parameters, or their shapes; later calls do not."""
         if self._compiled is None:
-            self.lower(params, text_width)
-            self._compiled, self._lowered = self._lowered.compile(), None
+            self._compiled = self.lower(params, text_width).compile()
+            self._lowered = None
 
-    def lower(self, params: Any, text_width: int) -> None:
-        """All of a compile that reads jax's settings, which are each thread's own."""
-        self._lowered = self._lowered or self.traced(params, text_width).lower()
+    def lower(self, params: Any, text_width: int) -> Any:
+        """All of a compile that reads jax's settings, which are each thread's own; kept for it."""
+        lowered = self._lowered = self._lowered or self.traced(params, text_width).lower()
+        return lowered
 
     def traced(self, params: Any, text_width: int) -> Any:
         """The episode as jax traces it for one policy's parameters, or their shapes."""

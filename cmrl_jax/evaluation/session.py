@@ -101,7 +101,6 @@ class TrainingProgram:
         if seeds > 1:
             first = lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype)
             self.metrics = jax.tree.map(first, self.metrics)
-        self._lowered: Any = None
         self._compiled: Any = None
 
     def init(self, seeds: Sequence[int]) -> RunState:
@@ -137,15 +136,10 @@ class TrainingProgram:
     def is_compiled(self) -> bool:
         return self._compiled is not None
 
-    def lower(self) -> None:
-        """All of a compile that reads jax's settings, which are each thread's own."""
-        self._lowered = self._lowered or self._traced.lower()
-
     def compile(self) -> Callable[[RunState], tuple[RunState, dict[str, jax.Array]]]:
         """The compiled iteration; later calls do not compile."""
         if self._compiled is None:
-            self.lower()
-            self._compiled, self._lowered = self._lowered.compile(), None
+            self._compiled = self._traced.lower().compile()
         return self._compiled
 
 
