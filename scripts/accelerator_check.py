@@ -167,9 +167,10 @@ def physics(size: Size, began: float) -> None:
     bench_backend("mjx", size.lanes, Lines())
 
 
-def learner(config_file: str, autotune: bool = True) -> None:
+def learner(config_file: str) -> None:
     from cmrl_jax.bench.main import bench_learner
 
+    autotune = NO_AUTOTUNING not in os.environ.get("XLA_FLAGS", "")
     bench_learner(cj.load_config(config_file), Lines(autotune=autotune))
 
 
@@ -206,8 +207,8 @@ PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
     "native-workers": (workers, 120),
     "large": (lambda s, t: learn("large", s.large, s, 1, t), 900),
     "large-learner": (lambda s, t: learner(s.large), 300),
-    f"large-learner{UNTUNED}": (lambda s, t: learner(s.large, autotune=False), 300),
-    f"learner{UNTUNED}": (lambda s, t: learner(s.main, autotune=False), 120),
+    f"large-learner{UNTUNED}": (lambda s, t: learner(s.large), 300),
+    f"learner{UNTUNED}": (lambda s, t: learner(s.main), 120),
     "naive": (naive, 300),
 }
 

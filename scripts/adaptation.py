@@ -19,7 +19,6 @@ import itertools
 import json
 import shlex
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ from cmrl_jax.config.schema import ConfigError  # noqa: E402
 from cmrl_jax.evaluation.statistics import seeds_interval  # noqa: E402
 from cmrl_jax.storage.documents import read_json  # noqa: E402
 from cmrl_jax.storage.packed import pack  # noqa: E402
-from cmrl_jax.storage.run_files import EVALUATION  # noqa: E402
 from scripts import experiments  # noqa: E402
 from scripts.experiments import refused  # noqa: E402
 
@@ -108,11 +106,6 @@ def typed(name: str) -> list[str]:
     return [*words, "--env.physics", "native", "--seed", str(seed), "--run", str(RUNS / name)]
 
 
-def train_command(name: str) -> list[str]:
-    """The same, or what goes on with a run that is there."""
-    return typed(name) + (["--resume"] if (RUNS / name / "config.yaml").exists() else [])
-
-
 def evaluations_of(name: str) -> list[str]:
     """What is asked of a run's policy; of Meta-World's own function in the paper's fold alone."""
     kind, fold, _ = parts(name)
@@ -153,11 +146,8 @@ def keep(name: str) -> None:
 def train(names: list[str]) -> int:
     """Makes the runs that are missing; the exit code of one that was stopped."""
     for name in names:
-        if not (RUNS / name / EVALUATION).exists():
-            print(f"== {name}", flush=True)
-            code = subprocess.run([sys.executable, *train_command(name)], cwd=ROOT).returncode
-            if code or not (RUNS / name / EVALUATION).exists():
-                return code or 1
+        if code := experiments.finish(RUNS / name, typed(name)):
+            return code
         if not (POLICIES / name).exists():
             keep(name)
     return 0

@@ -91,9 +91,18 @@ def typed(name: str) -> list[str]:
     return ["train.py", *shlex.split(EXPERIMENTS[name]), "--run", str(RUNS / name)]
 
 
-def command(name: str) -> list[str]:
-    """The same, or what goes on with a run that is there."""
-    return typed(name) + (["--resume"] if (RUNS / name / "config.yaml").exists() else [])
+def finish(run: Path, words: list[str]) -> int:
+    """Makes a run, or goes on with one that is there; 0 once it is finished, else an exit code.
+
+    Args:
+        words: what a user types to begin it.
+    """
+    if (run / EVALUATION).exists():
+        return 0
+    print(f"== {run.name}", flush=True)
+    resumed = ["--resume"] if (run / "config.yaml").exists() else []
+    code = subprocess.run([sys.executable, *words, *resumed], cwd=ROOT).returncode
+    return code or int(not (run / EVALUATION).exists())  # stopped: the next call goes on with it
 
 
 def keep(run: Path, kept: Path, words: list[str]) -> None:
@@ -137,11 +146,8 @@ def main(words: list[str]) -> int:
     if unknown:
         return refused(f"no experiment {unknown[0]}", f"choose from {', '.join(EXPERIMENTS)}")
     for name in words or EXPERIMENTS:
-        if not (RUNS / name / EVALUATION).exists():
-            print(f"== {name}", flush=True)
-            code = subprocess.run([sys.executable, *command(name)], cwd=ROOT).returncode
-            if code or not (RUNS / name / EVALUATION).exists():
-                return code or 1  # stopped: the next call goes on with it
+        if code := finish(RUNS / name, typed(name)):
+            return code
         keep(RUNS / name, RESULTS / name, typed(name))
     return 0
 

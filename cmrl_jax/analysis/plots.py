@@ -32,8 +32,9 @@ def _pyplot(needed_by: str = "plot") -> Any:
 def _panels(pyplot: Any, runs: Runs, ylabel: str) -> tuple[Any, dict[str, Any]]:
     """A figure with one panel a task."""
     count = len(runs.tasks)
-    size, shared = (3.4 * count, 3.2), {"sharex": True, "sharey": True}
-    figure, axes = pyplot.subplots(1, count, figsize=size, squeeze=False, **shared)
+    figure, axes = pyplot.subplots(
+        1, count, figsize=(3.4 * count, 3.2), sharex=True, sharey=True, squeeze=False
+    )
     for task, axis in zip(runs.tasks, axes[0], strict=True):
         axis.set_title(task + (" (held out)" if runs.is_held_out(task) else ""))
     axes[0, 0].set_ylabel(ylabel)

@@ -25,18 +25,14 @@ from cmrl_jax.cli import (
     train,
 )
 from cmrl_jax.cli.flags import COMMANDS, add_force, names, parse, parser_of
-from cmrl_jax.commands import command
 from cmrl_jax.config.files import (
     run_config,
 )
-from cmrl_jax.config.schema import ConfigError, call_envs, require
+from cmrl_jax.config.schema import ConfigError, call_envs
 from cmrl_jax.evaluation import finetune_options
 from cmrl_jax.stop import is_interrupt
-from cmrl_jax.storage.kept_policies import is_kept
 from cmrl_jax.storage.output_files import distinct, writable
-from cmrl_jax.storage.run_dir import (
-    find_run,
-)
+from cmrl_jax.storage.run_dir import find_own_run
 from envs.command_line import suggest, typed_path
 from envs.outputs import written_by
 
@@ -192,9 +188,7 @@ def _goals(words: list[str]) -> int:
 def _finetune(words: list[str]) -> int:
     parser = parser_of("finetune", finetune_flags.DESCRIPTION)
     args = parse(finetune_flags.add_flags(parser), words)
-    options, run = finetune_flags.options_of(args), find_run(args.run)
-    cause = f"{args.run} comes with the project without the state that finetune goes on from"
-    require(not is_kept(run), cause, f"train one of your own: {command('--config', 'ml4.yaml')}")
+    options, run = finetune_flags.options_of(args), find_own_run(args.run)
     finetune_options.check_run(run_config(run), options)
     distinct(json=args.json, figure=args.figure)
     writable(args.json, "--json", written_by("finetune"), args.force)

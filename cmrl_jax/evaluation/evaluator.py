@@ -121,23 +121,22 @@ class Evaluator:
         self.horizon = horizon or config.env.horizon
         self._train_tasks, self._env, self._agent = config.tasks.train, env, agent
         self._episode = jit_repeated(make_episode(env, agent, self.horizon))
-        self._lowered: Any = None
         self._compiled: Any = None
 
     @property
     def is_compiled(self) -> bool:
         return self._compiled is not None
 
-    def compile(self, params: Any, text_width: int) -> None:
-        """Compiles the episode for one policy's parameters, or their shapes; later calls do not."""
-        if self._compiled is None:
-            self._compiled = self.lower(params, text_width).compile()
-            self._lowered = None
+    def compile(self, params: Any, text_width: int, lowered: Any = None) -> None:
+        """Compiles the episode for one policy's parameters, or their shapes; later calls do not.
 
-    def lower(self, params: Any, text_width: int) -> Any:
-        """All of a compile that reads jax's settings, which are each thread's own; kept for it."""
-        lowered = self._lowered = self._lowered or self.traced(params, text_width).lower()
-        return lowered
+        Args:
+            lowered: `traced(...).lower()` of the same, where another thread has made it: jax's
+                settings are each thread's own.
+        """
+        if self._compiled is None:
+            lowered = lowered or self.traced(params, text_width).lower()
+            self._compiled = lowered.compile()
 
     def traced(self, params: Any, text_width: int) -> Any:
         """The episode as jax traces it for one policy's parameters, or their shapes."""

@@ -256,8 +256,8 @@ class _Training:
             return
         params = jax.eval_shape(self.algorithm.policy_params, self.program.one)
         shapes = params, self.session.goals.vectors.shape[-1]
-        self.evaluator.lower(*shapes)
-        self.evaluation_compile = self.threads.submit(self.evaluator.compile, *shapes)
+        lowered = self.evaluator.traced(*shapes).lower()
+        self.evaluation_compile = self.threads.submit(self.evaluator.compile, *shapes, lowered)
 
     def end_evaluation_compile(self) -> None:
         if self.evaluator.is_compiled:

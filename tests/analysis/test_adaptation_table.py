@@ -81,7 +81,7 @@ def test_episodes_needed_is_the_first_read_out_with_enough(table):
 
 def test_every_run_is_told_what_is_held_out(table):
     for name in table.runs():
-        words, (_, fold, seed) = table.train_command(name), table.parts(name)
+        words, (_, fold, seed) = table.typed(name), table.parts(name)
         train = words[words.index("--tasks.train") + 1].split(",")
         assert sorted([*train, fold]) == sorted(table.TASKS) and len(set(train)) == 3
         assert words[words.index("--seed") + 1] == str(seed)

@@ -186,7 +186,8 @@ class Objectives:
     def critic(self, trained: CriticSide, actor_params, target_params, log_alpha, data: Minibatch):
         """Loss, (zc, metrics); `target_params` are the target critics' or the V network's."""
         config = self.config
-        zc, kl, _ = inferred = self.infer(trained.encoder, data)
+        inferred = self.infer(trained.encoder, data)
+        zc, kl = inferred.zc, inferred.kl
         alpha = jnp.exp(log_alpha)[data.task_ids]
         zb = stop_gradient(zc)  # the target is stopped as a whole; this spares tracing its tangents
         target, clipped = self.critic_target(actor_params, target_params, alpha, zb, data)
