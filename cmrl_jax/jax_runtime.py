@@ -64,24 +64,36 @@ def first_device() -> Any:
         raise ConfigError(cause, cure) from error
 
 
-# XLA's CPU backend may hand sums and products to YNNPACK, fused with what stands around them. With
-# that the main job makes 28 gradient steps a second on one core instead of 52, and 41 instead of 63
-# on two (jaxlib 0.12.0, AVX2).
-WITHOUT_YNN = {"xla_cpu_experimental_ynn_fusion_type": ""}
+# Compiler options of programs that run often, by platform.
+REPEATED = {
+    # XLA's CPU backend may hand sums and products to YNNPACK, fused with what stands around them.
+    # With that the main job makes 28 gradient steps a second on one core instead of 52, and 41
+    # instead of 63 on two (jaxlib 0.12.0, AVX2).
+    "cpu": {"xla_cpu_experimental_ynn_fusion_type": ""},
+    # On a GPU XLA may write a kernel of its own for each product, by Triton, and try dozens of
+    # them. Ours are small: by cuBLAS a gradient step of ml4.yaml starts 344 kernels instead of 372,
+    # of ml4-large.yaml 427 instead of 461 (`bench --rows launches`), with nothing to try.
+    "gpu": {"xla_gpu_enable_triton_gemm": False},
+}
 
 
 @functools.cache
-def repeated_options() -> dict[str, str]:
-    """Compiler options of programs that run often; none where jaxlib lacks them, or off the CPU."""
-    if jax.default_backend() != "cpu":
-        return {}
+def repeated_options(platform: str | None = None) -> dict[str, Any]:
+    """Options of `REPEATED`; none where this jaxlib lacks them.
+
+    Args:
+        platform: as jax names it; by default that of this process.
+    """
+    if platform is not None:
+        return REPEATED.get(platform, {})
+    options = REPEATED.get(jax.default_backend(), {})
     try:
-        jax.jit(lambda: 0, compiler_options=WITHOUT_YNN)()
+        jax.jit(lambda: 0, compiler_options=options)()
     except RuntimeError as error:
         if "No such compile option" not in str(error):
             raise
         return {}
-    return WITHOUT_YNN
+    return options
 
 
 def jit_repeated(function: Callable[..., Any], **options: Any) -> Any:

@@ -163,7 +163,7 @@ def test_repeated_programs_keep_clear_of_ynnpack():
 
 
 def test_a_jaxlib_without_the_option_compiles_as_it_does(monkeypatch):
-    monkeypatch.setattr(jax_runtime, "WITHOUT_YNN", {"xla_cpu_no_such_option": ""})
+    monkeypatch.setitem(jax_runtime.REPEATED, "cpu", {"xla_cpu_no_such_option": ""})
     jax_runtime.repeated_options.cache_clear()
     try:
         assert jax_runtime.repeated_options() == {}

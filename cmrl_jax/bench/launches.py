@@ -2,8 +2,8 @@
 
 Small steps on a GPU cost what starting their kernels costs, so kernels started a step are the
 yardstick. A program is compiled for a described device, in a process of its own; nothing runs.
-Left out is what needs the device itself, the tuning of matrix products: compiling takes longer
-there. Needed are jax's two CUDA wheels and none of NVIDIA's libraries (`HOW`).
+Left out is what needs the device itself, the tuning of kernels: compiling takes longer there.
+Needed are jax's two CUDA wheels and none of NVIDIA's libraries (`HOW`).
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from cmrl_jax.bench.physics import CONTROL_STEPS, Report, random_steps
 from cmrl_jax.config.files import load_config
 from cmrl_jax.config.schema import ConfigError, require
 from cmrl_jax.evaluation.session import Session, prepare_jax
+from cmrl_jax.jax_runtime import repeated_options
 from cmrl_jax.streams import to_stderr
 
 HOW = (
@@ -180,9 +181,9 @@ def compile_for_gpu(name: str, config_file: str) -> dict[str, float]:
     )
     place = jax.sharding.SingleDeviceSharding(target.devices[0])
     placed = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place)
-    lowered = (
-        jax.jit(function).trace(*jax.tree.map(placed, shapes)).lower(lowering_platforms=("cuda",))
-    )
+    jitted = jax.jit(function, compiler_options=repeated_options("gpu"))
+    traced = jitted.trace(*jax.tree.map(placed, shapes))
+    lowered = traced.lower(lowering_platforms=("cuda",))
     started = time.perf_counter()
     compiled = lowered.compile()
     seconds = time.perf_counter() - started
