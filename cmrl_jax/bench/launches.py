@@ -34,7 +34,12 @@ HOW = (
     "python -m pip install --no-deps jax-cuda13-plugin=={0} jax-cuda13-pjrt=={0}; then, without a "
     "GPU, JAX_PLATFORMS=cpu JAX_SKIP_CUDA_CONSTRAINTS_CHECK=1 python train.py bench --rows launches"
 )
-PROGRAMS = ("gradient_step", "vector_step")
+# Programs, and the configurations that each is compiled for; any has the same physics.
+PROGRAMS = {
+    "gradient_step": ("ml4.yaml", "ml4-large.yaml"),
+    "vector_step": ("ml4.yaml",),
+    "training_iteration": ("ml4.yaml", "ml4-large.yaml"),
+}
 GRADIENT_STEPS, LANES = 100, 2048
 
 # What XLA asks a device to be; of an "NVIDIA H100 80GB HBM3".
@@ -125,8 +130,8 @@ def check_wheels() -> None:
     require(importlib.util.find_spec("jax_cuda13_plugin") is not None, cause, cure)
 
 
-def bench_launches(config_file: str, report: Report) -> None:
-    """Rows `launches/` of a configuration's learner and of the physics; skipped without the wheels.
+def bench_launches(report: Report) -> None:
+    """Rows `launches/` of every program; skipped without the wheels.
 
     Raises:
         ConfigError: a program does not compile.
@@ -136,20 +141,46 @@ def bench_launches(config_file: str, report: Report) -> None:
     except ConfigError as error:
         to_stderr(f"skipped: {error.cause} ({error.cure})")
         return
-    for name in PROGRAMS:
-        command = [sys.executable, "-m", "cmrl_jax.bench.launches", name, config_file]
-        # jax finds the plugin, and is not to look for a GPU.
-        quiet = {"JAX_PLATFORMS": "cpu", "JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1"}
-        run = subprocess.run(command, env=os.environ | quiet, stdout=subprocess.PIPE, text=True)
-        if run.returncode:
-            cause = f"program '{name}' does not compile for the described GPU, as shown above"
-            cure = HOW.format(importlib.metadata.version("jaxlib"))
-            raise ConfigError(cause, f"take the wheels of jaxlib's own version: {cure}")
-        row = json.loads(run.stdout.splitlines()[-1])
-        labels = {"device": "H100, described"} | ({"lanes": LANES} if name == "vector_step" else {})
-        report.add(f"launches/{name}", row["kernels"], "1", **labels)
-        report.add(f"launches/{name}_copies", row["copies"], "1", **labels)
-        report.add(f"launches/{name}_compile_s", row["compile_s"], "s", **labels)
+    for name, config_files in PROGRAMS.items():
+        for config_file in config_files:
+            row = compile_apart(name, config_file)
+            labels = {"device": "H100, described", "config": config_file}
+            if name == "vector_step":
+                labels["lanes"] = LANES
+            report.add(f"launches/{name}", row["kernels"], "1", **labels)
+            report.add(f"launches/{name}_copies", row["copies"], "1", **labels)
+            report.add(f"launches/{name}_compile_s", row["compile_s"], "s", **labels)
+            report.add(f"launches/{name}_spilled_bytes", row["spilled_bytes"], "1", **labels)
+
+
+def compile_apart(name: str, config_file: str) -> dict[str, float]:
+    """What `compile_for_gpu` finds, in a process of its own, and bytes of registers spilled.
+
+    Of each thread, by all kernels together: one that spills thousands is a kernel that XLA made too
+    large, slow to compile and to run.
+
+    Raises:
+        ConfigError: the program does not compile.
+    """
+    command = [sys.executable, "-m", "cmrl_jax.bench.launches", name, config_file]
+    # jax finds the plugin, and is not to look for a GPU; XLA tells what the assembler warns of.
+    told = {
+        "JAX_PLATFORMS": "cpu",
+        "JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1",
+        "TF_CPP_MIN_LOG_LEVEL": "0",
+    }
+    run = subprocess.run(command, env=os.environ | told, capture_output=True, text=True)
+    if run.returncode:
+        to_stderr(run.stderr)
+        cause = f"program '{name}' does not compile for the described GPU, as shown above"
+        cure = HOW.format(importlib.metadata.version("jaxlib"))
+        raise ConfigError(cause, f"take the wheels of jaxlib's own version: {cure}")
+    return json.loads(run.stdout.splitlines()[-1]) | {"spilled_bytes": spilled_bytes(run.stderr)}
+
+
+def spilled_bytes(log: str) -> int:
+    """Bytes that the assembler says were stored for want of registers."""
+    return sum(int(number) for number in re.findall(r"(\d+) bytes spill stores", log))
 
 
 def program(name: str, config_file: str) -> tuple[Any, tuple[Any, ...], int]:
@@ -166,6 +197,9 @@ def program(name: str, config_file: str) -> tuple[Any, tuple[Any, ...], int]:
 
     if name == "gradient_step":
         return gradient_steps, (jax.eval_shape(session.algorithm.init, key), key), GRADIENT_STEPS
+    if name == "training_iteration":
+        iteration = session.algorithm.make_iteration(session.train_placements())
+        return iteration, (jax.eval_shape(session.algorithm.init, key),), 1
     if name != "vector_step":
         raise ValueError(f"unknown program '{name}'")
     reset = lambda key: jax.vmap(env.reset)(jax.random.split(key, LANES), jnp.zeros(LANES, int))

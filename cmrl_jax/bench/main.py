@@ -158,7 +158,7 @@ KINDS = {
     "gymnasium": lambda config, report: bench_gymnasium(report),
     "learner": bench_learner,
     "start": bench_start,
-    "launches": lambda config, report: bench_launches(CONFIG, report),
+    "launches": lambda config, report: bench_launches(report),
     "naive": lambda config, report: bench_physics.bench_naive(report),
 }
 

@@ -34,6 +34,7 @@ import jax
 import jax.numpy as jnp
 
 from cmrl_jax.config.schema import Config
+from cmrl_jax.jax_runtime import apart
 from cmrl_jax.nn.distributions import LOG_STD_MAX, LOG_STD_MIN, Gaussian
 from cmrl_jax.nn.layers import MLP, Initialisers, Linear, ModuleLayer, make_initialisers
 
@@ -111,7 +112,7 @@ class SoftModularNet(nn.Module):
         for layer in range(1, self.layers):
             gate = e if layer == 1 else self.condition(f"routing_in_{layer}", matrices) * e
             matrices.append(probabilities(f"routing_{layer}", gate, n, n))
-            u = nn.relu(mix(matrices[-1], m))  # NOTE 4, (..., module, width)
+            u = apart(nn.relu(mix(matrices[-1], m)))  # NOTE 4, (..., module, width)
             u = normed(f"module_norm_{layer}", u)  # NOTE 9
             m = ModuleLayer(n, self.module_width, init, name=f"modules_{layer}")(u, shared=False)
         gate = self.condition("routing_in_final", matrices) * e

@@ -11,7 +11,7 @@ import pytest
 
 from cmrl_jax.bench import launches
 from cmrl_jax.bench.launches import Launches, bench_launches, count_launches
-from cmrl_jax.bench.main import CONFIG, Report
+from cmrl_jax.bench.main import Report
 from cmrl_jax.config.schema import ConfigError
 
 
@@ -71,7 +71,7 @@ ENTRY %main (x: f32[2]) -> f32[2] {
 
 def test_without_the_wheels_they_are_skipped_or_refused(tmp_path, capsys, monkeypatch, refused):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    bench_launches(CONFIG, Report(tmp_path / "bench.json", "cpu"))
+    bench_launches(Report(tmp_path / "bench.json", "cpu"))
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith("skipped: rows 'launches' need jax's CUDA wheels")
     cause, cure = refused("bench", "--rows", "launches", "--json", str(tmp_path / "bench.json"))
@@ -80,23 +80,37 @@ def test_without_the_wheels_they_are_skipped_or_refused(tmp_path, capsys, monkey
     assert not (tmp_path / "bench.json").exists()
 
 
-def test_a_program_that_does_not_compile_stops_it_and_leaves_the_rows(tmp_path, monkeypatch):
+def test_a_program_that_does_not_compile_stops_it_and_leaves_the_rows(
+    tmp_path, monkeypatch, capsys
+):
     row = 'noise\n{"kernels": 9.5, "copies": 1, "compile_s": 3}\n'
-    answers = [subprocess.CompletedProcess((), 0, row), subprocess.CompletedProcess((), 1, "")]
+    ptxas = "function 'fusion_4', {} bytes spill stores, 9 bytes spill loads\n"
+    warned = ptxas.format(700) + "other\n" + ptxas.format(44)
+    answers = [
+        subprocess.CompletedProcess((), 0, row, warned),
+        subprocess.CompletedProcess((), 1, "", "no such device\n"),
+    ]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(subprocess, "run", lambda command, **options: answers.pop(0))
+    monkeypatch.setattr(launches, "PROGRAMS", {"gradient_step": ("a.yaml",), "vector_step": ("b",)})
     with pytest.raises(ConfigError, match="'vector_step' does not compile"):
-        bench_launches(CONFIG, Report(tmp_path / "bench.json", "cpu"))
+        bench_launches(Report(tmp_path / "bench.json", "cpu"))
     rows = json.loads((tmp_path / "bench.json").read_text())["rows"]
     figures = {row["name"]: row["value"] for row in rows}
-    assert figures["launches/gradient_step"] == 9.5 and len(figures) == 3
+    assert figures["launches/gradient_step"] == 9.5 and len(figures) == 4
+    assert figures["launches/gradient_step_spilled_bytes"] == 744
+    assert "no such device" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_a_gradient_step_of_the_main_job_is_counted(tmp_path, monkeypatch):
+@pytest.mark.parametrize("config_file", ["ml4.yaml", "ml4-large.yaml"])
+def test_a_gradient_step_is_few_kernels_that_fit_their_registers(
+    tmp_path, monkeypatch, config_file
+):
     if importlib.util.find_spec("jax_cuda13_plugin") is None:
         pytest.skip("needs the wheels that check_wheels names")
-    monkeypatch.setattr(launches, "PROGRAMS", ("gradient_step",))
-    bench_launches(CONFIG, Report(tmp_path / "bench.json", "cpu"))
-    kernels, *_ = json.loads((tmp_path / "bench.json").read_text())["rows"]
-    assert kernels["name"] == "launches/gradient_step" and 50 < kernels["value"] < 400
+    monkeypatch.setattr(launches, "PROGRAMS", {"gradient_step": (config_file,)})
+    bench_launches(Report(tmp_path / "bench.json", "cpu"))
+    kernels, *_, spilled = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    assert kernels["name"] == "launches/gradient_step" and 50 < kernels["value"] < 500
+    assert spilled["name"].endswith("_spilled_bytes") and spilled["value"] < 1000

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax.lax import stop_gradient
 
+from cmrl_jax.jax_runtime import apart
+
 
 def soft_value(q: jax.Array, log_prob: jax.Array, alpha: jax.Array) -> jax.Array:
     """V(s) = min_k Q_k(s, a) - alpha_i log pi(a | s).
@@ -90,7 +92,7 @@ def categorical_target(
     values = (reward + discount * entropy_bonus)[..., None] + discount[..., None] * support
     is_clipped = (values < support[0]) | (values > support[-1])
     clipped = jnp.mean(jnp.sum(probabilities * is_clipped, axis=-1))
-    target = project_categorical(probabilities, values, support)
+    target = apart(project_categorical(*apart((probabilities, values)), support))
     return stop_gradient(target), stop_gradient(clipped)
 
 
