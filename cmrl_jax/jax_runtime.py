@@ -8,6 +8,7 @@ work, or are the user's own business.
 from __future__ import annotations
 
 import functools
+import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -70,23 +71,25 @@ REPEATED = {
     # With that the main job makes 28 gradient steps a second on one core instead of 52, and 41
     # instead of 63 on two (jaxlib 0.12.0, AVX2).
     "cpu": {"xla_cpu_experimental_ynn_fusion_type": ""},
-    # On a GPU XLA may write a kernel of its own for each product, by Triton, and try dozens of
-    # them. Ours are small: by cuBLAS a gradient step of ml4.yaml starts 344 kernels instead of 372,
-    # of ml4-large.yaml 427 instead of 461 (`bench --rows launches`), with nothing to try.
-    "gpu": {"xla_gpu_enable_triton_gemm": False},
+    # For a GPU XLA may write a kernel of its own for each product, by Triton, and try dozens of
+    # them and of cuBLAS's. Ours are small. By cuBLAS, as it comes, a gradient step of ml4.yaml
+    # starts fewer kernels, and a training iteration compiles in half the time.
+    "gpu": {"xla_gpu_enable_triton_gemm": False, "xla_gpu_autotune_level": 0},
 }
 
 
 @functools.cache
 def repeated_options(platform: str | None = None) -> dict[str, Any]:
-    """Options of `REPEATED`; none where this jaxlib lacks them.
+    """Options of `REPEATED`, but for what XLA_FLAGS names; none where this jaxlib lacks them.
 
     Args:
         platform: as jax names it; by default that of this process.
     """
+    named = os.environ.get("XLA_FLAGS", "")
+    options = REPEATED.get(platform or jax.default_backend(), {})
+    options = {name: value for name, value in options.items() if name not in named}
     if platform is not None:
-        return REPEATED.get(platform, {})
-    options = REPEATED.get(jax.default_backend(), {})
+        return options
     try:
         jax.jit(lambda: 0, compiler_options=options)()
     except RuntimeError as error:

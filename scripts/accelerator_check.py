@@ -30,7 +30,6 @@ import cmrl_jax as cj  # noqa: E402
 from cmrl_jax.cli.flags import add_force, names, parse, whole  # noqa: E402
 from cmrl_jax.config.schema import ConfigError, require  # noqa: E402
 from cmrl_jax.evaluation.session import prepare_jax  # noqa: E402
-from cmrl_jax.jax_runtime import REPEATED  # noqa: E402
 from cmrl_jax.storage.output_files import writable  # noqa: E402
 from envs.command_line import Parser, suggest, typed_path  # noqa: E402
 from envs.outputs import written_by  # noqa: E402
@@ -171,10 +170,7 @@ def physics(size: Size, began: float) -> None:
 def learner(config_file: str) -> None:
     from cmrl_jax.bench.main import bench_learner
 
-    autotune = NO_AUTOTUNING not in os.environ.get("XLA_FLAGS", "")
-    bench_learner(
-        cj.load_config(config_file), Lines(autotune=autotune, triton="gpu" not in REPEATED)
-    )
+    bench_learner(cj.load_config(config_file), Lines(xla_flags=os.environ.get("XLA_FLAGS", "")))
 
 
 def workers(size: Size, began: float) -> None:
@@ -191,17 +187,19 @@ def naive(size: Size, began: float) -> None:
 
 def play(name: str, size: Size, began: float) -> None:
     """A part, in the process that is its own."""
-    if name.endswith(UNTUNED):  # read once, when jax looks for its device
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {NO_AUTOTUNING}"
-    if name.endswith(TRITON):
-        del REPEATED["gpu"]
+    for ending, flags in FLAGS.items():
+        if name.endswith(ending):  # read once, when jax looks for its device
+            os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
     prepare_jax(cj.load_config(size.main))  # its precision holds for what builds no run, too
     PARTS[name][0](size, began)
 
 
-UNTUNED = "-untuned"  # what trying kernels for each product is worth, and what it costs
-NO_AUTOTUNING = "--xla_gpu_autotune_level=0"
-TRITON = "-triton"  # the same of products by kernels that XLA writes, its own default
+# What it is worth, and costs, to try kernels for each product; with Triton's as XLA has it.
+TUNED, TRITON = "-tuned", "-triton"
+FLAGS = {
+    TUNED: "--xla_gpu_autotune_level=4",
+    TRITON: "--xla_gpu_autotune_level=4 --xla_gpu_enable_triton_gemm=true",
+}
 # Name -> what it does, and the seconds that it may take at most.
 PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
     "device": (device, 60),
@@ -213,9 +211,9 @@ PARTS: dict[str, tuple[Callable[[Size, float], None], float]] = {
     "native-workers": (workers, 120),
     "large": (lambda s, t: learn("large", s.large, s, 1, t), 900),
     "large-learner": (lambda s, t: learner(s.large), 300),
-    f"large-learner{UNTUNED}": (lambda s, t: learner(s.large), 300),
+    f"large-learner{TUNED}": (lambda s, t: learner(s.large), 300),
     f"large-learner{TRITON}": (lambda s, t: learner(s.large), 300),
-    f"learner{UNTUNED}": (lambda s, t: learner(s.main), 120),
+    f"learner{TUNED}": (lambda s, t: learner(s.main), 120),
     f"learner{TRITON}": (lambda s, t: learner(s.main), 120),
     "naive": (naive, 300),
 }

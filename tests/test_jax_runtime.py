@@ -169,3 +169,13 @@ def test_a_jaxlib_without_the_option_compiles_as_it_does(monkeypatch):
         assert jax_runtime.repeated_options() == {}
     finally:
         jax_runtime.repeated_options.cache_clear()
+
+
+def test_what_xla_flags_names_is_left_to_it(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_autotune_level=4")
+    jax_runtime.repeated_options.cache_clear()
+    try:
+        options = jax_runtime.repeated_options("gpu")
+    finally:
+        jax_runtime.repeated_options.cache_clear()
+    assert options == {"xla_gpu_enable_triton_gemm": False}

@@ -2,7 +2,6 @@
 
 Small steps on a GPU cost what starting their kernels costs, so kernels started a step are the
 yardstick. A program is compiled for a described device, in a process of its own; nothing runs.
-Left out is what needs the device itself, the tuning of kernels: compiling takes longer there.
 Needed are jax's two CUDA wheels and none of NVIDIA's libraries (`HOW`).
 """
 

@@ -45,9 +45,8 @@ def test_every_part_ends_and_leaves_its_figures(check):
     assert figures["main-again/first_iteration_s"] < figures["main/first_iteration_s"]
     assert figures["mjx/control_steps_per_s"] > 0
     rates = [r for r in document["rows"] if r["name"] == "learner/gradient_steps_per_s"]
-    ways = [(r["autotune"], r["triton"]) for r in rates]
-    default, untuned, triton = (True, False), (False, False), (True, True)
-    assert ways == [default, default, untuned, triton, untuned, triton]
+    tuned, triton = accelerator_check.FLAGS.values()
+    assert [r["xla_flags"] for r in rates] == ["", "", tuned, triton, tuned, triton]
     assert all(r["value"] > 0 for r in rates)
     workers = [r["workers"] for r in document["rows"] if r["name"].startswith("native_workers/")]
     assert workers[:2] == [1, 2]

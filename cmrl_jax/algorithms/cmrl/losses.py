@@ -92,7 +92,8 @@ def categorical_target(
     values = (reward + discount * entropy_bonus)[..., None] + discount[..., None] * support
     is_clipped = (values < support[0]) | (values > support[-1])
     clipped = jnp.mean(jnp.sum(probabilities * is_clipped, axis=-1))
-    target = apart(project_categorical(*apart((probabilities, values)), support))
+    probabilities, values = apart((probabilities, values))
+    target = apart(project_categorical(probabilities, values, support))
     return stop_gradient(target), stop_gradient(clipped)
 
 
