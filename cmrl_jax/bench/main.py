@@ -4,7 +4,7 @@ Kinds of rows (`--rows`) are the keys of `KINDS`. Physics rows stand in `bench/p
 `bench/stages.py` and `bench/vector_envs.py`; here are the learner (gradient steps) and the start
 (seconds from the command to the end of the first iteration, with an empty and a filled compilation
 cache, and peak memory), both of the main job. `bench/launches.py` counts the kernels that a step
-starts on a GPU.
+starts on a GPU, and times how long its programs compile.
 """
 
 from __future__ import annotations

@@ -30,7 +30,8 @@ def figures_of(document):
 
 
 @pytest.mark.slow
-def test_every_part_ends_and_leaves_its_figures(check):
+def test_every_part_ends_and_leaves_its_figures(check, monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     parts = [name for name in PARTS if name not in ("device", "naive")]
     code, document = check("--parts", ",".join(parts))
     figures = figures_of(document)

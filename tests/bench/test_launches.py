@@ -103,14 +103,14 @@ def test_a_program_that_does_not_compile_stops_it_and_leaves_the_rows(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("config_file", ["ml4.yaml", "ml4-large.yaml"])
+@pytest.mark.parametrize(("config_file", "most"), [("ml4.yaml", 370), ("ml4-large.yaml", 480)])
 def test_a_gradient_step_is_few_kernels_that_fit_their_registers(
-    tmp_path, monkeypatch, config_file
+    tmp_path, monkeypatch, config_file, most
 ):
     if importlib.util.find_spec("jax_cuda13_plugin") is None:
         pytest.skip("needs the wheels that check_wheels names")
     monkeypatch.setattr(launches, "PROGRAMS", {"gradient_step": (config_file,)})
     bench_launches(Report(tmp_path / "bench.json", "cpu"))
     kernels, *_, spilled = json.loads((tmp_path / "bench.json").read_text())["rows"]
-    assert kernels["name"] == "launches/gradient_step" and 50 < kernels["value"] < 500
+    assert kernels["name"] == "launches/gradient_step" and 50 < kernels["value"] < most
     assert spilled["name"].endswith("_spilled_bytes") and spilled["value"] < 1000
